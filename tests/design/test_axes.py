@@ -723,7 +723,7 @@ def switching_room(loop: Loop, coupling: ForceFilter, alpha: tuple[float, ...]) 
     return float(np.linalg.eigvalsh(root @ room @ root.T).min())
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 @pytest.mark.parametrize(
     "loop",
     [

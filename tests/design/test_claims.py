@@ -375,7 +375,7 @@ def test_a_this_environment_guarantee_ends_with_stiffer_springs():
     assert required(1.0, 10.0) < DELTA
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_clipping_lets_a_certified_loop_swing_forever():
     """A certified loop with lossless hands rests, but may swing at 1.2 Hz for ever if forces are clipped.
 

@@ -178,7 +178,7 @@ def test_causal_parts_match_the_transform():
     np.testing.assert_allclose(_causal(grid, heights, w[at]), -np.fft.rfft(D, n=2**18)[:, at].T, rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 @pytest.mark.parametrize("channels", [2, *(pytest.param(n, marks=pytest.mark.validate) for n in (3, 4))])
 def test_parallel_walls_have_one_walls_bound(channels):
     """Parallel walls are separate problems, so their bound is that of one wall."""

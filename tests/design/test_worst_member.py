@@ -221,7 +221,7 @@ def test_design_check_repeats_the_search(tmp_path, capsys):
 # the design
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_range_designs_hold_between_their_ends():
     found = optimal.design(MASS, Options(bases=((4, 3),)))
     assert found.proved
