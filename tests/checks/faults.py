@@ -30,7 +30,7 @@ LATE = 0.595  # [s] from arming to a time before most faults
 _LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
-#: bounds on the time to zero [ms], each with one tick for the sampling of the fault
+#: bounds on the time to zero force [ms], each with one tick for the sampling of the fault
 _AT_ONCE = 2 * _T_MS  # an e-stop acts at the next tick; a session that ended before _WHEN has zero force at _WHEN
 _STOP = 8 * _T_MS  # the frame that shows the fault, the STOP, 5 ticks of ramp
 _WATCHDOG = 12 * _T_MS  # theta, 4 ticks with a held force, 5 of ramp, one to notice
@@ -52,7 +52,7 @@ class Fault:
     within: float | None = None  # [ms] from _WHEN to zero force; None: not measured
     action: _Call | None = None  # the action of a person or of a faulty controller
     acts: float = _WHEN  # [s] from arming to the action
-    host_stall: float = 0.0  # [s] that the host freezes at _WHEN
+    host_stall: float = 0.0  # [s] time for which the host freezes from _WHEN
     info: Callable[[Info], Info] | None = None  # changes the INFO of the device
     baud: int | None = None
     continuous: tuple[float, ...] = ()  # [N] forces that the motors can hold for ever
@@ -107,7 +107,7 @@ def _signed(
 
 
 G, A = Stage, Stage.ARMED
-#: a motion that is too small fails the test only with the strongest force, 120 ms later
+#: 120 ms are added because a motion that is too small fails the test only with the strongest force
 _ENDED: dict[str, Any] = {"action": person("stop"), "within": 2 * (100.0 + _TESTED) + 120.0, "lasts": 1.8}
 _UNFOUND: dict[str, Any] = {"action": person("stop"), "acts": 0.9, "lasts": 1.9}
 _LATE = at("down:jitter=0.0007")
@@ -166,13 +166,13 @@ CASES = (
     Fault("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
     Fault("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
     *_signed(
-        "a force of {} N of its own on axis {}",
+        "an uncommanded force of {} N on axis {}",
         "own",
         2,
         "it was told .*; 5 ticks or more were wrong",
         _STOP + 6 * _T_MS,
     ),
-    Fault("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.3",), _AT_ONCE),
+    Fault("an uncommanded force in ramp-in", G.STOPPED, "it was told", ("own=2@0.3",), _AT_ONCE),
     Fault("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
     Fault("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
     Fault("clock drifts by 0.5 %", A, faults=at("period=1.005")),
@@ -198,7 +198,7 @@ CASES = (
     ),
     Fault("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
     Fault("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _STOP),
-    Fault("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Fault("a channel of encoder 1 dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
     Fault("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _STOP),
     Fault("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
     Fault("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
@@ -510,7 +510,7 @@ def _prepared(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ..
 
 
 def _actions(case: Fault, rehearsal: Rehearsal) -> list[tuple[float, _Call]]:
-    """Return what a person does in a case, or that the host freezes."""
+    """Return the action of a case with its time [s]; without an action the host freezes for `host_stall`."""
 
     def frozen(session: Session, now: int) -> Said:
         rehearsal.freeze(case.host_stall)
@@ -567,8 +567,8 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None, force: floa
     return wrong
 
 
-_DEFAULT_CAP = 1.3  # [N] of hw.bridge
-_MOST_SPEED = 1.0  # [m/s] that no fault may exceed at a free handle
+_DEFAULT_CAP = 1.3  # [N] default force cap of hw.bridge
+_MOST_SPEED = 1.0  # [m/s] speed that no free handle may exceed
 
 
 def table() -> int:

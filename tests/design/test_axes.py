@@ -132,7 +132,7 @@ ONE = np.eye(2)
 SPRINGS = between(rotated(30, [900, 300]), rotated(-50, [700, 200]), np.array([[50.0, 10.0], [10.0, 80.0]]))
 MASS = Plane(4, np.diag([0, 0, 0, 0, 0.5, 0.5]), between(0.5 * ONE, 0.4 * ONE, 0.2 * ONE), SPRINGS)
 LOOP = _with(environment=MASS)
-#: one device's environment: springs (900 N/m along x, 300 along y) to 0.5 kg, and a fifth as stiff from it to ground
+#: one device's environment: 0.5 kg on springs to the tip (900 N/m along x, 300 along y), and to ground a fifth as stiff
 CORNER = Plane(
     2,
     np.diag([0, 0, 0.5, 0.5]),
@@ -167,7 +167,7 @@ def test_any_environment_takes_matrix_levels() -> None:
 
 def test_latency_takes_matrix_levels() -> None:
     late = msgspec.structs.replace(LOOP, latency=((1e-4, 3e-4),) * 2 + ((2e-4, 2e-4),) * 2)
-    # Without q12, q11 < 1/t2 and q22 < 1/(T - t1) of device 1. The constant latency of device 2 has only zeros.
+    # With q12 = 0, device 1 needs q11 < 1/t2 and q22 < 1/(T - t1). For a constant latency, as of device 2, all are 0.
     apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)
     assert required_damping(late, BUILT, "this-environment", apart).ratio == pytest.approx(0.619369, abs=5e-7)
     assert required_damping(late, BUILT, "this-environment").ratio < 0.619369
@@ -324,7 +324,7 @@ def test_a_stiffness_matrix_meets_its_closed_form() -> None:
 def test_walls_need_damping_along_their_normal(theta: int, damping: float, needs: float) -> None:
     """A wall that needs c on one axis has s = c n' Delta^-1 n, the least s with s Delta >= c n n'; n is its normal.
 
-    Separate code gave c = 4.2221 with five digits; the closed forms are k T/2 + b and, one sample late, 3 k T/2.
+    Separate code gave c = 4.2221 with five digits; closed forms are k T/2 + b, and 3 k T/2 one sample late if b = 0.
     """
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
@@ -445,7 +445,7 @@ def period_forms(loop: Loop, share: float, beta: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("loop", [ONE_KNOWN, pytest.param(KNOWN, marks=pytest.mark.validate)])
 def test_known_devices_take_full_levels(loop: Loop) -> None:
-    """He[[F/(z-1), 0], [-beta F/z, 0]] + L(dx, v, z v) is positive just above the requirement, and not just below."""
+    """He[[F/(z-1), 0], [-beta F/z, 0]] + L(dx, v, z v) is positive just above the requirement, but not below."""
     m = loop.channels
     coupling = _MatrixSpringDamper(BUILT.K[:m, :m], BUILT.B[:m, :m])
     needs = required_damping(loop, coupling, KNOWN_DEVICE)
@@ -646,11 +646,11 @@ def test_encoder_friction_is_a_norm_over_axes() -> None:
 
 
 def test_stiffest_coupling_attains_the_matrix_bound() -> None:
-    """V(1) >= T/2 blockdiag(n_i Delta_i^-1), so device 1 allows K = Delta_1/T = [[1500, 400], [400, 900]] N/m."""
+    """V(1) >= T/2 blockdiag((theta_i + 1) Delta_i^-1), so device 1 allows K = Delta_1/T."""
     design = design_by_kind(LOOP, "moving-average")
     assert design.requirement.certified
     V1 = design.coupling.compliance(LOOP.T).dc()
-    np.testing.assert_allclose(np.linalg.inv(V1)[:2, :2], [[1500, 400], [400, 900]], rtol=2e-4)  # 2e-4 softer
+    np.testing.assert_allclose(np.linalg.inv(V1)[:2, :2], [[1500, 400], [400, 900]], rtol=2e-4)  # the design is softer
     bound = LOOP.T / 2 * np.diag([2.0, 2.0, 3.0, 3.0]) @ np.linalg.inv(LOOP.Delta())
     assert np.linalg.eigvalsh(V1 - bound)[0] > 0
     assert prove(LOOP, design.coupling, "any-environment").proof == "rational"
@@ -690,7 +690,7 @@ def test_a_turned_filter_keeps_its_static_share() -> None:
 
 
 def test_switching_searches_take_delays_per_device() -> None:
-    """An option gives delays per device. The room's slope by gains and multipliers equals central differences."""
+    """An option gives delays per device. The slope of `room`, the condition's slack, equals central differences."""
     loop = msgspec.structs.replace(LOOP, levels=None)
     span = delay_range(((0, 1), (2, 2)), loop, 9)
     assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))
@@ -705,8 +705,8 @@ def test_switching_searches_take_delays_per_device() -> None:
 def switching_room(loop: Loop, coupling: ForceFilter, alpha: tuple[float, ...]) -> float:
     """Return the least eigenvalue of the switching block at Z, relative to Delta/T, assembled by hand.
 
-    The block is He[mean G/(z-1)] + Delta/T - alpha W/2 - h^2/(2 alpha) G* W^-1 G with W = Delta/mean(diag Delta) and
-    the mean of z^-lo and z^-hi; the error of a device's delayed force is bounded in the metric W^-1.
+    The block is He[mean G/(z-1)] + Delta/T - alpha W/2 - h^2/(2 alpha) G* W^-1 G. G is the map to the sent force,
+    W = Delta/mean(diag Delta), h = (hi - lo)/2, and `mean` is that of z^-lo and z^-hi.
     """
     assert loop.varying_delay
     lo, hi = (np.array(n) for n in (loop.varying_delay.lo, loop.varying_delay.hi))

@@ -182,7 +182,7 @@ def test_proof_and_sweep_agree_on_both_sides():
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of 1 to 3 contacts and a coupling. Delta is 0.5 to 1.5 of the requirement, at most of 100 N s/m."""
+    """Return a star of 1 to 3 contacts and a coupling. Delta is 0.5 to 1.5 times min(requirement, 100 N s/m)."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]
@@ -334,8 +334,8 @@ def test_the_bound_on_rounding_holds_over_ticks():
 def test_proof_and_run_agree_near_sharp_resonances():
     """The responses of the float and the rational loop are computed exactly at a point of the circle near a sharp peak.
 
-    Their response in floating point errs by more than they differ. `rounding` still bounds their difference, and the
-    filter is proved.
+    The rational loop's response in floating point errs by more than they differ. `rounding` still bounds their
+    difference, and the filter is proved.
     """
     springs = (("a", "m", 1000.0, 0.01), ("m", "n", 100.0, 0.0), ("n", "k", 1000.0, 0.0), ("k", "b", 3000.0, 0.01))
     parts = tuple(Spring((one, other), stiffness, damping) for one, other, stiffness, damping in springs)
@@ -572,7 +572,7 @@ def of_own_spring(stiffness: float) -> Loop:
     return Loop(1e-3, (1,), (0,), (0,), (1.37,), Own())
 
 
-def test_own_environments_have_their_own_certificates():
+def test_environments_of_equal_class_names_need_separate_proofs():
     """A spring k alone needs (theta + 1/2) k T: 0.75 N s/m for 500 N/m, 7.5 for 5000, so one proof covers one of them.
 
     `proves` does not verify a certificate that this process has made, so only the digest tells the two loops apart.

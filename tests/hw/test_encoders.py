@@ -21,11 +21,11 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.scenario import InputError, load
 
 T = 1.2e-3
-STEP = 4e-4  # [N]
+STEP = 4e-4  # [N] per step of force
 
 
 def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step=None, stop=None, **settings):
-    """Run a session until `seconds` after arming, stopped at `stop` [s]; return it and its rehearsal."""
+    """Run a session until `seconds` after arming, and stop it at `stop` [s] if given; return session and rehearsal."""
     if encoder_step:
         devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
         scenario = scenario.replace(device=devices)
@@ -219,9 +219,9 @@ def test_friction_and_weight_are_no_faults(friction, weight):
 
 @pytest.mark.parametrize(("share", "q", "sign"), checkered([0.0, 0.15, 0.5, 0.7], [1e-6, 1e-5], [1, -1]))
 def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
-    """The axis moves 0.54 to 0.88 times as far as expected. The two directions differ by (1 - share) / (1 + share).
+    """A motor that makes `share` of the force in one direction moves 0.54 to 0.88 times as far as expected.
 
-    For a share of 0.7 this is 0.18, and 0.2 is allowed.
+    Its directions differ by (1 - share) / (1 + share). For a share of 0.7 this is 0.18, and 0.2 is allowed.
     """
     weak = masses(q=q, motor=lambda force: np.where(sign * force > 0, force, share * force))
     if share == 0.7:
@@ -233,7 +233,10 @@ def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
 
 @pytest.mark.parametrize(("share", "q", "sign"), checkered([0.0, 0.5, 0.7, 2.0], [1e-6, 1e-5], [1, -1]))
 def test_counts_lost_in_one_direction_are_named(sign, share, q):
-    """The counted positions are sums of increments, of which those in one direction are `share` times as large."""
+    """The counted positions are sums of increments, of which those in one direction are `share` times as large.
+
+    With a share of 0.7 axis 1 passes, and axis 2, whose encoder stands still, is refused.
+    """
     fine = masses(q=1e-3 * q)
 
     def lossy(k, applied):
@@ -252,7 +255,7 @@ def test_counts_lost_in_one_direction_are_named(sign, share, q):
     ("zone", "friction", "q"), [(0.1, 0.0, 1e-6), (0.3, 0.0, 1e-6), (0.3, 0.0, 1e-5), (0.3, 0.1, 1e-6)]
 )
 def test_a_dead_zone_is_named(zone, friction, q):
-    """Of a force F the motor makes F - zone. With F = 0.65 N and 0.3 N this is 0.54 F, and with 1.3 N it is 0.77 F."""
+    """Of a force F the motor makes F - zone. For a zone of 0.3 N this is 0.54 F at 0.65 N, and 0.77 F at 1.3 N."""
     rubs = rubbing(friction, q=q)
 
     def zoned(k, applied):
@@ -549,7 +552,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
-    """An impulse of 0.1 N s since the last motion raises SafetyStop: 1 N in 100 ms, 5 N in 20 ms, but 0.95 N never."""
+    """Force changes above 1 N stop a session after an impulse of 0.1 N s without motion; 0.95 N never does."""
     monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
@@ -640,7 +643,7 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
 
 @pytest.mark.parametrize("place", [0.03, pytest.param(-0.03, marks=pytest.mark.slow)])
 def test_handles_off_centre_feel_little_force(scenario, rungs, place):
-    """Free handles at 30 mm feel less than 0.5 N if positions count from there; counted from the middle, over 3 N."""
+    """Free handles at 30 mm feel below 0.5 N if positions count from there, and over 3 N if from the middle."""
     still = nobody(scenario)
     session, rehearsal = session_with(still, rungs, place=place, seconds=0.6, held=False)
     assert session.stage == Stage.ARMED

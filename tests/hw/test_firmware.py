@@ -127,7 +127,7 @@ class Traffic:
         return Config(self.theta, rng.randint(0, 4), rng.randint(1, 6), rng.choice((0, 0, 3, 100)), cap, slew)
 
     def force(self) -> Force:
-        """Return a valid FORCE in time: mostly RUN with a random force, in DISARMED IDLE or ARM with zero force."""
+        """Return a valid FORCE in time: mostly RUN with a random force, but IDLE or ARM with zero force if DISARMED."""
         d, rng = self.device, self.rng
         source = d.k
         command, force = rng.choice((Command.IDLE, Command.ARM)), (0,) * d.info.axes
@@ -371,7 +371,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 
 @needs_gcc
-def test_the_headers_need_no_library_or_heap(tmp_path):
+def test_headers_need_only_standard_c_without_heap(tmp_path):
     """Apart from haptic_frame.h, the headers include only headers of standard C99, and they use no floating point.
 
     The compiled harness calls memcpy, memset and strncpy only.
@@ -441,7 +441,7 @@ def compiled_sketch(tmp_path_factory):
 
 @pytest.fixture
 def sketch(compiled_sketch, tmp_path):
-    """Return a board that was just switched on. A copy of the library has static variables of its own."""
+    """Return a board that was just switched on. Each copy of the library has separate static variables."""
     return Sketch(Path(shutil.copy(compiled_sketch, tmp_path)))
 
 
@@ -592,7 +592,7 @@ def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
 
 
 def test_a_ramp_is_the_same_at_zero_force(device):
-    """A RAMP at zero force lasts as long as any other, and refuses a CONFIG, too."""
+    """A RAMP at zero force lasts as long as any other RAMP, and refuses a CONFIG, too."""
     device.armed(theta=1, ramp=5, force=(0, 0))
     device.tell(Stop(0))
     phases = []

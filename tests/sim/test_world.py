@@ -569,7 +569,7 @@ class _Random:
 
 
 def test_figures_at_a_port_are_sums_over_ticks():
-    """The acting force differs from the sent one, as behind a delay."""
+    """The least energy at a port and the energy given equal sums by hand; the sent force is halved before it acts."""
     rng, V = np.random.default_rng(0), SpringDamper([500.0, 700.0], [0.5, 0.4]).compliance(T)
     ports, damping = [_Random(rng, 0.03), _Random(rng, 0.01)], np.array([[1.4, 0.2], [0.2, 1.1]]) / T
     world = InWorld(Shell(V, start=0.02, nsim=2), ports, damping)

@@ -1,6 +1,6 @@
-"""Ratios of the K-B map equal closed forms and those of single couplings; its verdicts equal those of single loops.
+"""Test the map over gains K and B: its ratios equal closed forms and single couplings, its verdicts single loops.
 
-Tolerances without a comment cover rounding; divided by T, that of eigenvalues is up to 1e-7 1/s.
+Tolerances without a comment cover rounding. Eigenvalues round by up to 1e-7 1/s, after division by T.
 """
 
 import csv
@@ -221,7 +221,7 @@ def test_bad_grids_are_refused_and_defaults_fit():
 
 
 def test_edges_interpolate_along_their_axis():
-    K, ratio = np.array([1.0, 10.0, 1000.0]), np.array([0.1, 0.75, 1.75])  # 1 is a quarter of the way
+    K, ratio = np.array([1.0, 10.0, 1000.0]), np.array([0.1, 0.75, 1.75])  # 1 is a quarter of the way from 0.75 to 1.75
     assert zwidth_map._interpolated(K, ratio, 1, "linear") == pytest.approx(257.5)
     assert zwidth_map._interpolated(K, ratio, 1, "log") == pytest.approx(10 * 10**0.5)
 
@@ -306,7 +306,7 @@ def test_sustained_oscillations_are_told_from_decays():
     ]
     found = oscillation(np.concatenate([x for x, _ in cases], axis=2), T, 1e-5)
     assert found.sustained.tolist() == [verdict for _, verdict in cases]
-    # An octave has the amplitude of its line; when measured, the relative error was 1e-7 in the middle of an octave.
+    # An octave's amplitude is that of the sinusoid in it; the relative error was 1e-7 in the middle of an octave.
     assert found.amplitude[0] == pytest.approx(1e-4, rel=0.02)
     assert found.frequency_hz[0] == pytest.approx(40, abs=1)  # the spectrum's lines are 1.3 Hz apart
     assert np.isinf(found.amplitude[-1])
@@ -324,7 +324,7 @@ def test_a_slow_swing_that_decays_is_no_oscillation():
         assert not oscillation(slow, T, 1e-5).sustained.any()
         found = oscillation(slow + 2e-5 * np.sin(2 * np.pi * 6 * t), T, 1e-5)
         assert found.sustained.all()
-        assert found.amplitude == pytest.approx(2e-5, rel=0.2)  # 6 Hz is near an edge: 1 % when measured
+        assert found.amplitude == pytest.approx(2e-5, rel=0.2)  # 6 Hz is near an octave's edge: the error was 1 %
 
 
 def walled(count):
@@ -554,7 +554,7 @@ def test_maps_write_files_and_repeat_with_their_seed(tmp_path):
 
 
 def test_maps_show_what_known_devices_allow(tmp_path):
-    """With guaranteed bounds of the devices, damped walls are certified that this-environment refuses."""
+    """At a rigid wall guaranteed bounds of the device certify spring-dampers that this-environment refuses."""
     file, known = tmp_path / "r.json", ["--rigid", "--scenario", "omega-pair-known", "--T", "1e-3", "--theta", "0"]
     part = ["--K-range", "500,1000", "--B-range", "1.4,2", "--grid", "4", "--points", "0", "--humans", "5"]
     zwidth.main([*known, *part, "--out", str(tmp_path), "--no-plot", "--json", str(file)])
