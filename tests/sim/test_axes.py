@@ -151,7 +151,7 @@ def test_hands_have_the_axes_of_their_devices(link: str, more: str, words: str) 
 def test_persons_hold_devices_with_the_same_axes() -> None:
     person = "person = [{ holds = [1, 2], mass = 30.0, damping = 80.0, stiffness = 900.0 }]\n"
     text = TEXT.replace("FIRST", "").replace("SECOND", 'clamped = ["z"]').replace("MORE", "")
-    with pytest.raises(InputError, match=r"person #1.holds is \[1, 2\].* theirs are x, y, z; x, y"):
+    with pytest.raises(InputError, match=r"person #1.holds is \[1, 2\].* free axes are x, y, z; x, y"):
         parse(person + text)
 
 
