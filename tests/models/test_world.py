@@ -214,7 +214,11 @@ def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
         if not data.nefc:
             continue
         rows = Rows.of(port.world.model, data)
+        inside = [np.where(rows.one_sided, np.minimum(r, 0), r) for r in (rows.depth, rows.depth + T * rows.after)]
+        before, after = (rows.D * rows.K * r**2 / 2 for r in inside)  # energy [J] that the contacts store
         excess, bound = rows.excess(T), rows.bound(T)
+        by_hand = np.add.reduceat(T * rows.force * rows.after + after - before, rows.first)
+        np.testing.assert_allclose(excess, by_hand, rtol=0, atol=1e-15)  # rounding of terms up to 1 J
         assert (excess <= bound + 1e-15).all()  # rounding of terms up to 1 J
         created += np.maximum(excess, 0.0).sum()
         count += len(excess)
