@@ -254,7 +254,9 @@ def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
     assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
 
 
-@pytest.mark.parametrize("code", [IN_EXEC, IN_C], ids=["exec", "compiled"])
+@pytest.mark.parametrize(
+    "code", [pytest.param(IN_EXEC, id="exec", marks=pytest.mark.slow), pytest.param(IN_C, id="compiled")]
+)
 def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
     # Case none has no coupling to design, so that MuJoCo is imported soon.
     command = "sim.run --case none --duration 0.05 --no-plot"

@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 from concurrent.futures import Executor, Future
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -39,30 +40,36 @@ from haptic_loop.sim.view.session import GIVEN, Menu, first_loop
 FREE_MASS = next((Path(__file__).parents[2] / "benchmarks" / "loops").glob("n4*.toml"))
 SMALL = ((4, 3),)
 FORMS = ("filter", "delayed", "pair")
+#: `make test` leaves out the forms that are designed here, in three seconds
+SOME = (*(pytest.param(form, marks=pytest.mark.slow) for form in FORMS[:2]), "pair")
 CC = shutil.which("gcc") or shutil.which("cc")
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """Return form -> (scenario, its name in commands, file of the coupling)."""
-    folder, made = tmp_path_factory.mktemp("optimal"), {}
-    for form, name in zip(FORMS, ("omega-pair", str(FREE_MASS), "omega-pair"), strict=True):
-        scenario = load(name)
-        loop, path = scenario.loop("I"), folder / f"{form}.json"
+def file_of(tmp_path_factory):
+    """Return a function from a form to (scenario, its name in commands, file of the coupling)."""
+    folder = tmp_path_factory.mktemp("optimal")
+
+    @cache
+    def made(form):
+        name = str(FREE_MASS) if form == "delayed" else "omega-pair"
+        scenario, path = load(name), folder / f"{form}.json"
+        loop = scenario.loop("I")
         if form == "pair":
             save(Stored.of(loop, VERTICES_ONLY, prove(loop, VERTICES_ONLY, "this-environment")), path)
         else:
             found = design(loop, Options(bases=SMALL, limiter=form == "filter"))
             save(Stored.of(loop, found.coupling, found.certificate), path)
-        made[form] = scenario, name, path
+        return scenario, name, path
+
     return made
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
-def test_coupling_files_prove_and_drive_the_process(files, form):
+def test_coupling_files_prove_and_drive_the_process(file_of, form):
     """Forces are displacements convolved with the impulse response that samples of F on the circle |z| = 1.05 give."""
-    scenario, _, path = files[form]
+    scenario, _, path = file_of(form)
     stored, loop = load_file(path), scenario.loop("I")
     assert verify(stored).proved
     assert isinstance(stored.built(), _InternalModel if form == "pair" else ForceFilter)
@@ -83,8 +90,8 @@ def test_coupling_files_prove_and_drive_the_process(files, form):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
-def test_run_and_validate_take_couplings_of_each_form(files, form, tmp_path):
-    _, name, path = files[form]
+def test_run_and_validate_take_couplings_of_each_form(file_of, form, tmp_path):
+    _, name, path = file_of(form)
     common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
     asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]
     assert run.main(asked) == 0
@@ -97,8 +104,9 @@ def test_run_and_validate_take_couplings_of_each_form(files, form, tmp_path):
     assert (batch["unstable"], batch["holds"]) == ({"exact": 0, "mujoco": 0}, True)
 
 
-def test_forces_are_limited_as_the_file_proves(files):
-    scenario, _, path = files["filter"]
+@pytest.mark.slow
+def test_forces_are_limited_as_the_file_proves(file_of):
+    scenario, _, path = file_of("filter")
     weak = tuple(msgspec.structs.replace(device, force_limit=0.3) for device in scenario.device)
     scenario = scenario.replace(device=weak, duration=0.6)
     coupling = load_file(path).built()
@@ -111,10 +119,10 @@ def test_forces_are_limited_as_the_file_proves(files):
 
 
 @pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
-@pytest.mark.parametrize("form", FORMS)
-def test_exports_repeat_to_the_last_bit(files, form, tmp_path):
+@pytest.mark.parametrize("form", SOME)
+def test_exports_repeat_to_the_last_bit(file_of, form, tmp_path):
     out, limit = tmp_path / "p.c", ["--force-limit", "3"] if form == "filter" else []
-    assert export.main([str(files[form][2]), "--process", *limit, "--out", str(out)]) == 0
+    assert export.main([str(file_of(form)[2]), "--process", *limit, "--out", str(out)]) == 0
     built = [str(CC), "-std=c99", "-ffp-contract=off", "-DHAPTIC_LOOP_TEST", str(out), "-o", str(tmp_path / "p"), "-lm"]
     subprocess.run(built, check=True)
     done = subprocess.run([tmp_path / "p"], capture_output=True, text=True, check=False)
@@ -129,9 +137,9 @@ class _Never(Executor):
         return Future()
 
 
-@pytest.mark.parametrize("form", [*FORMS[:2], pytest.param("pair", marks=pytest.mark.slow)])
-def test_the_live_window_equals_the_simulator(files, form):
-    scenario, _, path = files[form]
+@pytest.mark.parametrize("form", SOME)
+def test_the_live_window_equals_the_simulator(file_of, form):
+    scenario, _, path = file_of(form)
     shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
     running = live.LiveLoop(shown, _Never(), (), np.inf)
     frame = running.frame(0.25)
@@ -142,8 +150,8 @@ def test_the_live_window_equals_the_simulator(files, form):
 
 
 @pytest.mark.parametrize("form", [pytest.param("filter", marks=pytest.mark.slow), "pair"])
-def test_the_bridge_rehearses_optimal_couplings(files, form):
-    scenario, _, path = files[form]
+def test_the_bridge_rehearses_optimal_couplings(file_of, form):
+    scenario, _, path = file_of(form)
     couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: couplings)

@@ -159,6 +159,7 @@ def test_forces_latch_within_their_tick():
         Timing(np.array([1e-3]), np.array([[1e-3]]))
 
 
+@pytest.mark.slow
 def test_a_run_reports_the_times_of_ticks(tmp_path, capsys):
     file = tmp_path / "r.json"
     recorded = tmp_path / "ticks.txt"
