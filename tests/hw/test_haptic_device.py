@@ -192,7 +192,7 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
 @pytest.mark.slow
 def test_certificates_of_host_clocks_name_period_and_latency(scenario):
     """Certificates name T_max and a latency below one sample; no whole tick is charged for the link."""
-    _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
+    _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1, own=SOFT)
     assert made.assessment.loop.theta == scenario.theta  # no tick is added for the link
     assert made.link == 0
     assert made.assessment.decisive.certified

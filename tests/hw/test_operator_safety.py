@@ -184,21 +184,6 @@ def rehearsal_until_finished(scenario, rungs):
     return session
 
 
-@pytest.mark.slow
-def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
-    """With a cap of 10 mN, more than half of the forces at full gain are cut."""
-    recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
-    session.record = recorder
-    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
-    rehearsal.run_until_armed(2.5)
-    session.stop("enough", session.now)
-    rehearsal.run(1e-6 * session.now + 0.5)
-    assert session.stage == Stage.FINISHED
-    report = outcome("I", session, recorder, 0)
-    assert report.session.stage == session.stage == "stopped"
-    assert "% of the forces were cut" in report.session.cause
-
-
 def test_a_second_of_clipped_forces_counts(scenario, rungs):
     """A session has not finished if more than half of the 833 ticks of any second were clipped, however long it was."""
     session = rehearsal_until_finished(scenario, rungs)

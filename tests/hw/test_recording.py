@@ -15,9 +15,9 @@ from haptic_loop.cli import trace as trace_command
 from haptic_loop.design.files import plain
 from haptic_loop.hw.control import CertifiedCoupling, _fill, certified_coupling
 from haptic_loop.hw.emulator import Emulator
-from haptic_loop.hw.limits import SafetyLimits, Stage, Units
+from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.monitor import LinkSettings
-from haptic_loop.hw.recording import Recorder, _digest, _recipes_of, load, replay
+from haptic_loop.hw.recording import Recorder, _digest, load, replay
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import outcome, save
@@ -65,24 +65,6 @@ def test_a_replay_is_identical_bit_by_bit(trace):
     compared = replay(result, link)
     assert compared.identical
     assert np.abs(link["sent"]).max() > 1000
-
-
-@pytest.mark.slow
-def test_twice_armed_sessions_replay_both_couplings(scenario, rungs, tmp_path):
-    recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, "down:jitter=0.0007@0.45", recorder=recorder)
-    session = rehearsal.run_until_armed(1.2)
-    assert session.stage == Stage.DISARMED
-    session.arm(session.now)
-    rehearsal.run(1e-6 * session.now + 0.8)
-    session.stop("enough", session.now)
-    rehearsal.run(1e-6 * session.now + 0.2)
-    files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
-    result, link = load(files[0])
-    assert [recipe.link_delay for recipe in _recipes_of(result)] == [1, 2]
-    assert np.bincount(link["arming"]).min() > 300
-    assert replay(result, link).identical
-    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
 
 
 def test_a_replay_finds_one_changed_bit(trace):
