@@ -45,7 +45,7 @@ _Condition = ConditionName | Condition
 
 
 def requirement(loop: Loop, coupling: Coupling, condition: _Condition) -> Requirement:
-    """Return the damping that the condition requires of the devices."""
+    """Return the damping that the condition requires of the devices; infinite if the loop is singular."""
     resolved = named(condition)
     try:
         return resolved.judge(loop, coupling)
@@ -191,7 +191,7 @@ def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
 def sensitivity(
     loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None
 ) -> _Sensitivity:
-    """Return the errors in delta, T and delay that the certificate tolerates; `needs` is its requirement, if known."""
+    """Return the errors in delta, T and delay that the certificate tolerates; `needs` is the requirement, if known."""
     resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
@@ -294,7 +294,7 @@ class _Remedy:
 
 
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower the requirement, `needs` if known, by more than 10 %."""
+    """Return single changes that certify the coupling or lower its requirement (`needs`, if known) by over 10 %."""
     resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []
@@ -365,7 +365,7 @@ class Audit:
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
-    switching: SwitchingFigures | None
+    switching: SwitchingFigures | None  # None for constant delays
     helps: list[Help]  # empty for delays that switch, for which no change is searched
     constant: dict[str, Requirement] = off_table("left out")  # the requirements to which `margins` belong
     not_covered: str = CAVEATS
@@ -400,7 +400,7 @@ def audit(
     assessment = assess(loop, coupling, condition=wanted, ranges_seed=seed, force_limit=force_limit, progress=progress)
     needs, switching = assessment.requirements, None
     if loop.varying_delay:
-        from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start without it.
+        from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start faster without it.
 
         switching = SwitchingFigures.of(loop, coupling, needs["switching"])
         needs = {name: each.judge(constant, coupling) for name, each in conditions.items()}

@@ -123,7 +123,7 @@ class Collected(Generic[Block]):
         self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of f_e, scale)
         self._steps: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of the steps of f_e, scale)
-        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, y itself instead of its steps)
+        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, whether y, not its steps)
         self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
         self._gain: list[tuple[int, int, Any]] = []  # (row, input, weight) of terms that scale with the damping
@@ -541,7 +541,7 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
 
 
 class PeriodCost(NamedTuple):
-    """The coefficients of a lower bound L of the energy of a period, (m,) each, for known devices.
+    """The coefficients of the lower bound L of Theorem B for a period, (m,) each, for known devices.
 
     L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the two ends of the
     period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m. The formulas

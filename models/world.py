@@ -30,7 +30,7 @@ from haptic_loop.models.scene import quiet_warnings
 
 Array = NDArray[np.floating[Any]]
 
-_CONTACT_MASS = 0.03  # [kg] of a contact for which the scene states no mass; a density does not count
+_CONTACT_MASS = 0.03  # [kg] mass of a contact for which the scene states no mass; a density does not count
 ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
 _MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
@@ -61,7 +61,7 @@ class _Part:
 
     what: str
     count: int
-    at_the_port: str  # the bound
+    at_the_port: str  # the bound, in words
 
 
 def files_of(path: Path) -> list[Path]:
@@ -498,7 +498,7 @@ class WorldPort:
         """
         world = self.world
         goal = world._Q.T @ u0
-        # Between the steps of the scene its position is constant, so that the forces do no work.
+        # Between its steps the scene does not move, so the forces do no work.
         force = self._within(self._spring(goal)) if self.ticks % world.every else self._stepped(goal)
         self.ticks += 1
         return force
