@@ -198,7 +198,7 @@ CASES = (
     ),
     Fault("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
     Fault("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _STOP),
-    Fault("a channel of encoder 1 dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Fault("one channel of encoder 1 dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
     Fault("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _STOP),
     Fault("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
     Fault("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
