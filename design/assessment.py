@@ -167,7 +167,7 @@ class SearchFigures:
         ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else "no damping is enough"
         limit = "--seconds" if self.ended_by_clock else "its budget of counted work"
         ended = f", until {limit} ended the search" if self.ended_early else ""
-        return f"searched, not proved: {verdict}, {ratio} in {self.environments} points{ended}, at {self.worst}"
+        return f"searched, not proved: {verdict}, {ratio} in {self.environments} points{ended}; worst: {self.worst}"
 
 
 def check_ranges(
@@ -183,7 +183,7 @@ def check_ranges(
     """Check a coupling over the ranges of its loop by a condition that covers them; return None without ranges.
 
     The search is deterministic. In addition, `samples` environments are drawn at random from inside the ranges, with
-    `seed`. The search and the proof are not repeated if an earlier call or design supplies them as `searched` and
+    `seed`. The search and the proof are not repeated if the caller has them as `searched` and
     `certificate`. One set of multipliers serves all environments, including those between the vertices.
     """
     if loop.ranges is None:
@@ -224,7 +224,7 @@ def check_ranges(
 def _proved_ranges(
     loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate | None
 ) -> tuple[Certificate | None, str | None, Sequence[Any] | None]:
-    """Return (the certificate for all members or None, the reason why there is none, the multipliers)."""
+    """Return (the certificate for all members or None, the reason if it is None, the multipliers or None)."""
     if certificate and certificate.guarantee == RANGES and certificate.condition == condition.name:
         values = on_file(condition_of(certificate, condition), loop, certificate.multipliers)
         return certificate, None, values[: sum(condition.multiplier_sizes(loop).values())] if values else None
@@ -399,7 +399,7 @@ class EncoderSteps:
 
     @property
     def sentence(self) -> str:
-        """The restriction of a guarantee by the encoder steps, for a verdict."""
+        """The sentence of a verdict that says how encoder steps restrict the guarantee."""
         if not self.covered:
             return "Not covered: the encoder steps of the devices."
         return "Encoder steps are covered with this object only, while forces stay below their limits."
@@ -492,7 +492,7 @@ class Guarantee:
 
     @property
     def words(self) -> str:
-        """The environments, the energy if it is bounded, and the user's own condition, without encoder steps."""
+        """The environments, the bound of the energy, and the user's own condition, but not the encoder steps."""
         return f"{self._covered}, by the condition {self.own}, which is your own" if self.own else self._covered
 
     @property
@@ -746,7 +746,7 @@ def _force_limits(
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:
-    """Return the mismatch, with all walls touching, or None if it cannot be computed."""
+    """Return the mismatch of F and E with all walls touching, or None if it cannot be computed."""
     try:
         F, E = loop.F(coupling), loop.E()
     except ValueError:  # A rigid wall or a world has no E(z), and a singular loop has no F.
@@ -790,7 +790,7 @@ BELOW_LIMITS = "while they stay below their limits"
 
 
 def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """Return (the guarantee for the loop that runs or None, the reason why there is none)."""
+    """Return (the guarantee for the loop that runs, None) or (None, the reason why there is none)."""
     loop, requirements, limits = assessment.loop, assessment.requirements, assessment.force_limits
     decisive, own = requirements[assessment.condition], assessment.own
     plugged = shelled(assessment.environment)

@@ -511,6 +511,7 @@ class _Search:
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
     def run(self) -> _Best:
+        """Add cuts until the bound is within _GAP of the least share; return the best result of a refined sweep."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
