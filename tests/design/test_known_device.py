@@ -1148,12 +1148,12 @@ def test_walls_on_known_devices_are_proved_from_files():
 # ----------------------------------------------------------------------------------------------------
 # Limited forces on known devices.
 
-COUPLING, RHO = SpringDamper([1000.0], [0.5]), 13.0
+COUPLING, RHO = SpringDamper([1000.0], [0.5]), 13.0  # [N/m] the limiter's rho
 LIMITED = LimitedKnownDevice(LimitedForces(held=(RHO,)))
 
 
 def limited(theta, *walls):
-    """Return the loop of a known device; its environment is 50 g on 20 N/m and 0.3 N s/m, and `walls`."""
+    """Return the loop of a known device; its environment is 50 g on a spring and a damper, and `walls`."""
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
     return Loop(1e-3, (theta,), (0,), (0,), (1.37,), network, known_devices=(DEVICE,))
 

@@ -371,7 +371,7 @@ def test_every_body_has_its_place():
     scene = build(SCENARIO.device, [Human((Link(0.3, 3, 200), Link(1, 2, 300))), SCENARIO.human[1]])
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
     found = dict(zip(names, zip(_owners(scene), _places(scene), strict=True), strict=True))
-    assert found == {
+    assert found == {  # the device, and the place along its rail from the handle
         "device_1/motor": (0, -1),
         "device_2/motor": (1, -1),
         "device_1/handle": (0, 0),

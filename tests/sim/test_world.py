@@ -1,6 +1,7 @@
-"""MuJoCo worlds give hands no more than W0 = START_J and the released energy; unfit scenarios are refused.
+"""MuJoCo worlds give hands no more than their account, W0 = START_J and the energy that gravity and springs released.
 
-A world is a MuJoCo scene that hands touch through devices. Tolerances without a comment cover rounding.
+A world is a MuJoCo scene that hands touch through devices; its shell limits forces that would give more. Tolerances
+without a comment cover rounding.
 """
 
 import json
@@ -264,7 +265,7 @@ def test_an_active_scene_is_held_back(tmp_path):
 
 
 def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
-    """Return (least energy at the port [J], ticks on which the shell acts) for hands of 1 kg thrown at 1.5 m/s."""
+    """Return the least energy at the port [J] and the ticks on which the shell acts; hands of 1 kg fly at 1.5 m/s."""
     coupling = SpringDamper([1000.0, 1000.0], [0.5, 0.5])
     port, shell = scene_of(loop, coupling).port(), Shell(coupling.compliance(T), start=start)
     x, v, at_port, least, before = np.zeros(2), np.array([-1.5, 1.5]), 0.0, 0.0, port.u
