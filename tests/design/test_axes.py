@@ -297,12 +297,10 @@ def test_the_limiter_has_one_multiplier_per_device() -> None:
 def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> None:
     """2 % above the requirement a proof exists, and 2 % below it the sweep refuses. The limiter is proved for LOOP."""
     least = required_damping(LOOP, BUILT, condition).ratio
-    enough = scaled(LOOP, float(f"{1.02 * least:.6g}"))
-    if not isinstance(condition, str):  # rho is a share of the damping, so scaling would change the limiter
-        enough, condition = LOOP, condition
-    proof = prove(enough, BUILT, condition)
+    scales = isinstance(condition, str)  # rho is a share of the damping, so scaling would change the limiter
+    proof = prove(scaled(LOOP, float(f"{1.02 * least:.6g}")) if scales else LOOP, BUILT, condition)
     assert proof.proof == "rational"
-    if isinstance(condition, str):
+    if scales:
         assert required_damping(scaled(LOOP, 0.98 * least), BUILT, condition).ratio > 1
 
 
