@@ -8,10 +8,9 @@ from __future__ import annotations
 import atexit
 import gc
 import sys
-from functools import cache, partial
 from importlib import import_module
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from haptic_loop.cli import painter
 
@@ -57,38 +56,12 @@ def main() -> NoReturn:
 def _run(command: str, words: list[str]) -> NoReturn:
     if command == "run" and not {"--no-plot", "-h", "--help"} & {*words}:
         painter.begin()
-    _compile_on_first_call()
     atexit.register(gc.freeze)  # This prevents a last search for garbage, which takes 0.1 s.
     from haptic_loop.cli.execute import execute  # This import loads NumPy.
     from haptic_loop.design import forked
 
     forked.allowed = True
     execute(lambda argv: _command(command).main(argv), words)
-
-
-def _compile_on_first_call() -> None:
-    """Let dataclasses compile a method other than __init__ when it is called first.
-
-    The command run loads 120 dataclasses with 600 such methods, and calls few of them: this saves a twentieth of its
-    time. From Python 3.13 on, a class compiles all its methods at once, and this function does nothing.
-    """
-    import dataclasses
-
-    compiled: Any = getattr(dataclasses, "_create_fn", None)
-
-    def create(name: str, *arguments: Any, **options: Any) -> Any:
-        compile_it: Any = cache(partial(compiled, name, *arguments, **options))
-        if name == "__init__":
-            return compile_it()
-
-        def method(*values: Any) -> Any:
-            return compile_it()(*values)
-
-        method.__name__ = name
-        return method
-
-    if compiled:
-        dataclasses._create_fn = create  # type: ignore[attr-defined]
 
 
 def _command(name: str) -> ModuleType:

@@ -1,8 +1,6 @@
 """Every command's --help ends with two examples, whose arguments the command accepts."""
 
-import dataclasses
 import importlib
-import inspect
 import os
 import re
 import shlex
@@ -13,7 +11,7 @@ from pathlib import Path
 import pytest
 from forked import run
 
-from haptic_loop.cli.main import COMMANDS, _compile_on_first_call
+from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
 
 ROOT = Path(__file__).parents[2]
@@ -123,28 +121,3 @@ def test_the_console_script_lists_and_runs_commands():
     unknown = run("python -m cli chekc", ROOT)
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert unknown.stderr == "error: unknown command 'chekc', did you mean check?\n"
-
-
-@pytest.mark.skipif(not hasattr(dataclasses, "_create_fn"), reason="Python 3.13 compiles them at once")
-def test_methods_compiled_later_behave_the_same(monkeypatch):
-    """A class made with _compile_on_first_call does what the same class does that Python makes."""
-
-    def outcomes():
-        Point = dataclasses.make_dataclass("Point", [("x", float), ("y", float, 2.0)], frozen=True, order=True)
-        one, other = Point(1.0), Point(1.0, 3.0)
-        with pytest.raises(dataclasses.FrozenInstanceError) as refused:
-            one.x = 5.0
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            del one.x
-        with pytest.raises(TypeError) as missing:
-            Point()
-        pairs = one == Point(1.0), one == other, one < other, one >= other, one == 1.0
-        errors = str(refused.value), str(missing.value)
-        return repr(other), hash(other), pairs, dataclasses.replace(one, y=4.0).y, str(inspect.signature(Point)), errors
-
-    made = outcomes()
-    usual = vars(dataclasses)["_create_fn"]
-    monkeypatch.setattr(dataclasses, "_create_fn", usual)  # undone after the test
-    _compile_on_first_call()
-    assert vars(dataclasses)["_create_fn"] is not usual
-    assert outcomes() == made
