@@ -70,7 +70,10 @@ class Forked(Generic[_Result]):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # The second process ends with the first.
             os.nice(self._niceness)
             os.dup2(writer, 3)
-            os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+            for opened in os.listdir("/proc/self/fd"):
+                if int(opened) > 3:
+                    with suppress(OSError):  # the folder's own number
+                        os.close(int(opened))
             for stream in range(3):
                 os.dup2(os.open(os.devnull, os.O_RDWR), stream)
             with open(3, "wb") as file:
