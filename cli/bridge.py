@@ -94,7 +94,7 @@ def main(argv: list[str]) -> int:
 def _counted(program: CertifiedCoupling, steps: Sequence[float]) -> CertifiedCoupling:
     """Assess the coupling for the encoder steps (m,) [m] that the device reports."""
     encoder = encoder_steps(program.scenario, program.case, program.assessment, steps)
-    return replace(program, assessment=replace(program.assessment, encoder=encoder))
+    return replace(program, assessment=program.assessment.with_encoder(encoder))
 
 
 def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_boards: bool) -> None:

@@ -155,7 +155,7 @@ def _checked(
         verdict.reason,
         claim and claim.condition,
         (condition or named(claim.condition)).words(loop) if claim and proved else None,
-        "; ".join([f"T = {1e3 * loop.T:.6g} ms, {delays}", *(covered(loop, claim) if claim else ())]),
+        "; ".join([f"T = {1e3 * loop.T:.6g} ms, {delays}, exact positions", *(covered(loop, claim) if claim else ())]),
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
         searched and SearchFigures.of(searched),

@@ -68,8 +68,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
         swept = " A refined sweep shows this, without an exact proof." if guarantee.proof == "sampled" else ""
-        steps = f" {encoder.sentence}" if encoder and guarantee.counts_positions else ""
-        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}{steps}"
+        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}"
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
     felt = f": {_percent(share)} of the stiffness" if share else ""

@@ -464,6 +464,7 @@ class Guarantee:
             releases; None for a guarantee that the loop comes to rest.
         vertices: The proved vertices of "these ranges" in words: every vertex, or 128 of 625 vertices.
         own: Name and file of the user's own condition that gives the guarantee, in words, or None.
+        positions: The restriction by encoder steps in words that follow the environments (EncoderSteps.suffix), or "".
     """
 
     condition: str
@@ -477,6 +478,7 @@ class Guarantee:
     energy_J: float | None = None
     vertices: str = "every vertex"
     own: str | None = None
+    positions: str = ""
 
     def __repr__(self) -> str:
         return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, forces: {self.forces})"
@@ -492,8 +494,9 @@ class Guarantee:
 
     @property
     def words(self) -> str:
-        """The environments, the bound of the energy, and the user's own condition, but not the encoder steps."""
-        return f"{self._covered}, by the condition {self.own}, which is your own" if self.own else self._covered
+        """The environments, the bound of the energy, the user's own condition, and the limits by encoder steps."""
+        by = f", by the condition {self.own}, which is your own" if self.own else ""
+        return f"{self._covered}{by}{self.positions}"
 
     @property
     def _covered(self) -> str:
@@ -556,11 +559,16 @@ class Assessment:
 
     @property
     def guarantee_words(self) -> str | None:
-        """The guarantee with its restriction by encoder steps, in one line; None without a guarantee."""
-        if self.guarantee is None:
-            return None
-        limits = self.encoder.suffix if self.encoder and self.guarantee.counts_positions else ""
-        return f"{self.guarantee.words}{limits}"
+        """The guarantee in one line; None without a guarantee."""
+        return self.guarantee and self.guarantee.words
+
+    def with_encoder(self, encoder: EncoderSteps | None) -> Assessment:
+        """Return the assessment for devices with these encoder steps, which restrict its guarantee."""
+        guarantee = self.guarantee
+        if guarantee:
+            limits = encoder.suffix if encoder and guarantee.counts_positions else ""
+            guarantee = replace(guarantee, positions=limits)
+        return replace(self, encoder=encoder, guarantee=guarantee)
 
     @property
     def facts(self) -> tuple[str, ...]:

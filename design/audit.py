@@ -80,7 +80,7 @@ def check_loop(loop: Loop) -> None:
         if max(steps) > LONGEST_DELAY:
             raise ValueError(f"{name} is {listed(steps)}, allowed are 0 to {LONGEST_DELAY} samples")
     if not all(0 < d < np.inf for d in loop.delta):
-        raise ValueError(f"delta is {listed(loop.delta)}, expected positive dampings in N s/m")
+        raise ValueError(f"delta, the damping of devices, is {listed(loop.delta)}, expected positive numbers [N s/m]")
 
 
 # ----------------------------------------------------------------------------------------------------

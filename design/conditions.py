@@ -226,6 +226,14 @@ class Condition(ABC):
     covers: tuple[str, ...] = ()  # items of `BEYOND` that the block covers; a subclass does not inherit them
     source: str | None = None  # reference for a report
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Raise InputError for names in `covers` that are not in BEYOND."""
+        super().__init_subclass__(**options)
+        named = vars(cls).get("covers", ())
+        if not isinstance(named, tuple) or any(name not in BEYOND for name in named):
+            allowed = ", ".join(map(repr, BEYOND))
+            raise InputError(f"covers of the condition {cls.__name__} is {named!r}, expected a tuple of {allowed}")
+
     def separable(self, loop: Loop) -> bool:
         """Return whether the condition judges each channel alone for a coupling without cross terms."""
         return False

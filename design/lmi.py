@@ -28,7 +28,7 @@ RESERVE = 1e-4  # share of the damping that designs do not use, so that the roun
 def usable(loop: Loop) -> Array:
     """Return (1 - RESERVE) delta T/T_max (m,) [N s/m], which a design may use. Raises ValueError if a delta is 0."""
     if min(loop.delta) <= 0:
-        raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
+        raise ValueError(f"delta, the damping of devices, is {list(loop.delta)}, expected positive numbers [N s/m]")
     return (1 - RESERVE) * even_damping(loop)
 
 

@@ -124,7 +124,7 @@ def design(
     that has no design in this loop, and for a loop that no damping makes safe without a coupling.
     """
     if min(loop.delta) <= 0:
-        raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
+        raise ValueError(f"delta, the damping of devices, is {list(loop.delta)}, expected positive numbers [N s/m]")
     search = replace(_Search.of(loop, options), say=say)
     if exactly := search.nothing():
         return exactly

@@ -88,10 +88,12 @@ def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) ->
     """Call a user's own class or function.
 
     An InputError, and an error whose traceback has a line of the user's code, pass unchanged. Any other error, such as
-    that of wrong arguments, becomes an InputError that begins with `what`.
+    that of wrong arguments, becomes an InputError that begins with `what`, and so does sys.exit().
     """
     try:
         return make(*args, **options)
+    except SystemExit as error:
+        raise InputError(f"{what}: it ends the program by sys.exit({error.code!r})") from None
     except Exception as error:
         if isinstance(error, InputError) or place_of(error):
             raise

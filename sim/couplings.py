@@ -249,7 +249,7 @@ def qualified(scenario: Scenario, case: str, assessment: Assessment) -> Assessme
     forces may become older than any certificate covers.
     """
     plugged = shelled(assessment.environment)
-    assessment = replace(assessment, encoder=None if plugged else encoder_steps(scenario, case, assessment))
+    assessment = assessment.with_encoder(None if plugged else encoder_steps(scenario, case, assessment))
     if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.axis_devices):
         return assessment.without_guarantee("the devices have encoder steps, and the shell requires exact positions")
     budgeted = assessment.force_limits.energy_budget is not None and not plugged

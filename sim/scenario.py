@@ -819,7 +819,7 @@ def _direction(number: int, row: Any) -> list[float]:
     if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) and abs(c) < 1e6 for c in row):
         length = float(np.linalg.norm(row))
     if not 1e-6 < length < 1e6:
-        raise ValueError(f"environment.along #{number} is {row!r}, expected a direction [x, y, z], not all zero")
+        raise ValueError(f"environment.along #{number} is {row!r}, expected finite numbers [x, y, z], not all zero")
     return [c / length for c in row]
 
 
@@ -914,8 +914,11 @@ def _checked_own(value: Any) -> Any:
             raise ValueError(f"human #{i} is {human!r}, expected a Human, or a class with port(), voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # A Port that is not passive raises ValueError.
             raise ValueError(f"human #{i}.port() is {port!r}, expected a models.human.Port")
-        with np.errstate(all="ignore"):
-            force = np.asarray(human.voluntary_force(_TIMES))
+        try:
+            with np.errstate(all="ignore"):
+                force = np.asarray(human.voluntary_force(_TIMES))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"human #{i}.voluntary_force(t) fails for an array t of two times: {error}") from None
         if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
             raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected two forces in N")
     return tuple(value)

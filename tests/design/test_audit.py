@@ -397,7 +397,7 @@ BAD = [
     ("--coupling space.json --T 1e-3", "its coefficients are for T = 0.0012 s, the loop has 0.001 s"),
     ("--coupling nowhere.json", "nowhere.json: No such file"),
     ("--coupling broken.json", "broken.json: "),
-    ("--K 1 --B 1 --delta 0", "delta is 0, 0, expected positive dampings"),
+    ("--K 1 --B 1 --delta 0", "delta, the damping of devices, is 0, 0, expected positive numbers [N s/m]"),
     ("--K 1 --B 1 --delta=-1", "--delta is -1, allowed are 0 to 10000"),
     ("--K 1 --B 1 --delta nan", "--delta is nan, allowed"),
     ("--K 1 --B 1 --T 0", "T is 0, allowed"),

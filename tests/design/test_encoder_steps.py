@@ -218,6 +218,8 @@ def test_panels_and_bridge_tables_qualify_guarantees():
         program = CertifiedCoupling(0, scenario, "I", chosen, assessment)
         assert panel.endswith(words)
         assert _certified(program)[-1].endswith(words)
+        assert assessment.guarantee.part()["words"].endswith(words)
+        assert assessment.with_encoder(None).guarantee.positions == ""
 
 
 @pytest.mark.validate

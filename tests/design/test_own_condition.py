@@ -76,6 +76,13 @@ def test_a_condition_covers_only_what_it_names(name):
         prove(loop, coupling, Plain())
 
 
+@pytest.mark.parametrize("names", ["not psi", ("wals",), ["psi"], None, ({},)])
+def test_a_condition_covers_only_known_names(names):
+    """A string would cover each of its parts, and a wrong name nothing."""
+    with pytest.raises(InputError, match=r"^covers of the condition Wrong is .*, expected a tuple of 'psi', 'T_max', "):
+        type("Wrong", (Plain,), {"covers": names})
+
+
 def test_proofs_are_refused_by_conditions_that_cover_less():
     loop = change(PAIR, T_max=2e-3)
     assert required_damping(loop, SOFT, Uneven()).ratio == pytest.approx(

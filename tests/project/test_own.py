@@ -95,6 +95,10 @@ def soft():
 
 def negative():
     return hard(Negative)
+
+
+def leaves():
+    raise SystemExit(0)
 """
 RUN = "python -m sim.run --case I --duration 0.3 --no-plot"
 
@@ -136,6 +140,7 @@ def test_an_own_environment_is_proved_and_stored(name, covered, place):
         ("yours.py:X", "there is no file yours.py"),
         ("mine:Gel", "expected FILE.py:NAME"),
         ("ends.py:X", "SystemExit: 7"),
+        ("mine.py:leaves", "--environment mine.py:leaves: it ends the program by sys.exit(0)"),
     ],
 )
 def test_wrong_environments_are_refused(words, message, place):

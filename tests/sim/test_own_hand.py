@@ -211,6 +211,17 @@ def test_the_adversary_fails_against_enough_damping():
     assert not worst.destabilises
 
 
+def test_a_force_for_single_times_is_refused():
+    """The force of a hand is computed for an array of times."""
+
+    class Late(Muscle):
+        def voluntary_force(self, t):
+            return 1.0 if t > 0.1 else 0.0
+
+    with pytest.raises(InputError, match=r"human #1.voluntary_force\(t\) fails for an array t of two times: "):
+        held_by(Late(), Muscle())
+
+
 @pytest.mark.slow
 def test_the_adversary_takes_a_population_file(tmp_path):
     file, report = tmp_path / "who.py", tmp_path / "r.json"
