@@ -18,7 +18,7 @@ import numpy as np
 
 from haptic_loop.controller.arithmetic import SingularLoop, one_blas_thread
 from haptic_loop.controller.budget import START_J
-from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.coupling import Coupling, require_channels
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
@@ -680,6 +680,7 @@ def assess(
         own_search = coupling.searched if made and made.scenario == digest(loop, coupling.coupling.form()) else None
         searched, limiter_c, coupling = searched or own_search, limiter_c or coupling.c, coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
+    require_channels(coupling.form(), loop.channels)
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
     here = loop.at(network).switching(None)

@@ -408,3 +408,10 @@ def test_a_search_of_another_condition_is_repeated(monkeypatch):
 )
 def test_three_equal_dampings_print_once(values, text):
     assert listed(values, once=True) == text
+
+
+def test_couplings_of_other_channels_are_refused():
+    for count in (1, 3):
+        gains = [500.0] * count
+        with pytest.raises(ValueError, match=rf"K has {count} entries, the environment has 2 contacts"):
+            assess(load("omega-pair").loop("I"), SpringDamper(gains, gains))
