@@ -82,7 +82,7 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+    with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
         limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
         with options.refused():
             audited = audit(loop, coupling, condition, args.seed, limits, move)

@@ -225,7 +225,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
     """Assess the design in its loop, with the proof and the search between vertices that the design made."""
     from haptic_loop.sim.couplings import qualified
 
-    with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
+    with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
         assessment = assess(
             loop,
             design.coupling,

@@ -32,7 +32,7 @@ def assessment_of(
 ) -> Assessment:
     """Assess the coupling in the scenario's loop; `environment` replaces the scenario's in the run."""
     ranges = scenario.loop(args.case).ranges
-    with render.progress("searching the ranges" if ranges else "assessing the coupling") as move:
+    with render.progress("searching the ranges" if ranges else "proving the conditions") as move:
         return assessed(
             scenario,
             args.case,

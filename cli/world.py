@@ -66,7 +66,7 @@ class _Report:
 
 def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, start: float) -> _Report:
     """Return the report without figures of a run."""
-    with render.progress("assessing the coupling"):
+    with render.progress("proving the condition"):
         assessment = assessed(
             scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
         )

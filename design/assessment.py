@@ -662,7 +662,7 @@ def assess(
             others are searched only if these certify no limiter; known-device does not use them.
         force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
-        progress: Called with (points done, number of points) of the search over ranges.
+        progress: Called with (done, total) of the conditions, and then of the points of a search over ranges.
 
     Returns:
         The assessment. Its guarantee is for the environment that runs. `holds` also requires `condition` and, with
@@ -687,7 +687,7 @@ def assess(
     own = None if is_ours(wanted_condition) else wanted_condition
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
-    requirements = requirements_of(here, coupling, known, own=own)
+    requirements = requirements_of(here, coupling, known, own, progress)
     if wanted_condition.name not in requirements:
         requirements[wanted_condition.name] = judged(here, coupling, wanted_condition)
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -501,12 +501,14 @@ def requirements_of(
     coupling: Coupling,
     known: Certificate | None = None,
     own: Condition | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Requirement]:
     """Return the requirement of each condition of the package, and of the user's `own` condition if there is one.
 
     Each condition is proved exactly if possible. `known` is a certificate that holds; its proof is not repeated. A loop
     without bounds of its devices gets no known-device conditions. The environment is the nominal one and the delays
-    theta are constant; design.assessment adds ranges and switching.
+    theta are constant; design.assessment adds ranges and switching. `progress` is called with the number of finished
+    proofs and the number of conditions.
     """
     loop = loop.at(loop.environment).switching(None)
     conditions = (*conditions_of(loop), *([named(own)] if own else []))
@@ -514,10 +516,11 @@ def requirements_of(
 
     pairs = [(each, each.judge(loop, coupling)) for each in conditions]
 
-    def judged(each: Condition, needs: Requirement) -> Requirement:
+    def judged(i: int, each: Condition, needs: Requirement) -> Requirement:
+        progress(i, len(pairs))
         if each.name == proved:
             return replace(needs, proof="rational")
         return _with_proof(loop, filed(loop, coupling), each, needs)
 
     with within(budgets.EXACT):  # one budget for all proofs
-        return {each.name: judged(each, needs) for each, needs in pairs}
+        return {each.name: judged(i, each, needs) for i, (each, needs) in enumerate(pairs)}

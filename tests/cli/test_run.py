@@ -258,7 +258,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     code, _ = run(tmp_path, *one_device, "--coupling", "optimal", "--duration", "0.1", "--no-plot")
     shown, err = capsys.readouterr()
     assert code == 0
-    stages = ["designing the coupling", " dB)", "assessing the coupling", "simulating"]
+    stages = ["designing the coupling", " dB)", "proving the conditions", "simulating"]
     places = [err.index(stage) for stage in stages]
     assert places == sorted(places)
     assert not any(stage in shown for stage in stages)
