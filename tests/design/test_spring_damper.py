@@ -268,7 +268,7 @@ def test_proposed_changes_hold_when_made():
 REFUSALS = [
     ({"psi": (1, 1), "lam": (0, 0)}, r"admits no coupling: with psi = \(1, 1\).*uses up 1.479"),
     ({"lam": (2, 2)}, r"lam is \[2, 2\], expected at most theta \+ psi"),
-    ({"delta": (1.37, 0.0)}, "delta is .*expected positive"),
+    ({"delta": (1.37, 0.0)}, "delta, the damping of devices, is .*expected positive"),
     ({"delta": (1.37,)}, "delta has 1 entries, the environment has 2 contacts"),
     ({"theta": (1,)}, "theta has 1 entries, the environment has 2 contacts"),
     ({"theta": (1.5, 2)}, "theta is .*whole numbers"),

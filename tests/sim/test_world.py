@@ -425,7 +425,7 @@ def test_other_commands_refuse_a_world_in_one_line(words):
         (("contacts", "springs = []\ncontacts"), None),
         (("contacts", "masses = { a = 1.0 }\ncontacts"), "world and masses"),
         (("contacts", "along = [[1, 0, 0]]\ncontacts"), "along has 1 directions for 2 contacts"),
-        (("contacts", "along = [[1, 0, 0], [0, 0, 0]]\ncontacts"), "expected a direction"),
+        (("contacts", "along = [[1, 0, 0], [0, 0, 0]]\ncontacts"), "#2 is [0, 0, 0], expected finite numbers"),
         (("contacts", "every = 0\ncontacts"), "every is 0, allowed are 1 to 100 ticks"),
         (("theta =", "psi = [0, 1]\ntheta ="), "psi must be 0"),
         (("world =", "wrld ="), "unknown field `wrld`"),
