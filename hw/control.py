@@ -31,7 +31,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
 from haptic_loop.hw.encoders import EncoderMonitor, EncoderTest, Expected
-from haptic_loop.hw.limits import Heat, SafetyLimits, Units
+from haptic_loop.hw.limits import Heat, SafetyLimits, Units, largest_pulse
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
 from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.couplings import assessed, choose, given
@@ -304,21 +304,13 @@ class Drive:
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
-        self._path = deque[tuple[float, ...]](maxlen=4)  # [m] last displacements, without a gap between them
-        self._uneven = deque[float](maxlen=3)  # [s] by how much the lengths of the last ticks differ from T
+        self._path = deque[tuple[float, ...]](maxlen=4)  # [m] displacements of the last STATEs
+        self._gaps = deque[tuple[int, float]](maxlen=3)  # ticks between them, and how far their time [s] is from T each
         late = settings.behind or (0,) * config.axes
-        axes = zip(expected.mass, expected.mode, still, units.encoder_step, late, strict=True)
-        #: (m,) [m] largest jolt (`check_jolt`): by the force _JOLT, or by a motor that swings on its transmission at
-        #: the speed limit; plus the noise of the four positions, plus a repeated sample. The mass of a device that is
-        #: being identified is unknown, so that any jolt up to `jump` is possible.
-        self._jolts = [
-            max(_JOLT * limits.lever * T**2 / mass, 4 * limits.speed / w * math.sin(min(w * T, math.pi) / 2) ** 3)
-            + 2 * n * q
-            + limits.speed * T * (behind > 0)
-            if settings.test_encoders
-            else limits.jump
-            for mass, w, n, q, behind in axes
-        ]
+        noise = np.multiply(still, units.encoder_step).tolist()
+        #: (m,) mass [kg], mode of the transmission [rad/s], noise of a position [m], and whether samples may repeat
+        self._axes = [*zip(expected.mass, expected.mode, noise, (behind > 0 for behind in late), strict=True)]
+        self._weighs = settings.test_encoders  # The mass of a device that is being identified is unknown.
         self._clock_us = 0  # the device's clock at the last STATE
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming = counters, record, arming
@@ -419,16 +411,31 @@ class Drive:
         x, ticks = positions[-1], len(positions)
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
-        if ticks > 1:
-            self._path.clear()
         self._path.append(x)
-        self._uneven.append(abs(seconds - self.T))
+        self._gaps.append((ticks, abs(seconds - ticks * self.T)))
         if len(self._path) == 4:
-            longer = 2 * self.limits.speed * max(self._uneven)  # uneven ticks change displacements, not speeds
-            self.limits.check_jolt(self._path, [most + longer for most in self._jolts])
+            gaps, uneven = zip(*self._gaps, strict=True)
+            self.limits.check_jolt(self._path, gaps, self._largest_jumps(gaps, max(uneven)))
         self._recent.extend(positions)
         if (since := len(self._recent) - 1) >= self._window // 2:
             self.limits.check_speed(x, self._recent[0], since * self.T)
+
+    def _largest_jumps(self, gaps: tuple[int, int, int], uneven: float) -> list[float]:
+        """Return the largest jump (m,) [m] of each axis over `gaps` [ticks] that is not an error of its encoder.
+
+        It is the largest pulse of a motion, or any jump up to the limit of `jump` if the mass is unknown. The noise of
+        positions, ticks that are longer or shorter by `uneven` [s], and a repeated sample add to it.
+        """
+        limits, T, (p, q, r) = self.limits, self.T, gaps
+        both = 1 + q / min(p, r)  # An error of one position changes the speeds on both of its sides.
+        if not self._weighs:
+            return [limits.jump * q] * len(self._axes)
+        return [
+            largest_pulse(gaps, T, _JOLT * limits.lever * T**2 / mass, mode, limits.speed)
+            + both * (noise + limits.speed * uneven)
+            + limits.speed * T * repeats
+            for mass, mode, noise, repeats in self._axes
+        ]
 
 
 # couplings that are certified for a link

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -162,17 +163,18 @@ class SafetyLimits:
                 allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
-    def check_jolt(self, path: Sequence[tuple[float, ...]], most: Sequence[float]) -> None:
-        """Raise SafetyStop where an axis gained and lost more than `most` (m,) [m/tick] of speed within two ticks.
+    def check_jolt(self, path: Sequence[tuple[float, ...]], gaps: tuple[int, int, int], most: Sequence[float]) -> None:
+        """Raise SafetyStop where an axis jumped by more than `most` (m,) [m] between the second and third position.
 
-        `path` has the displacements (m,) [m] of four ticks in a row. A counting error leaves such a pulse of speed. A
-        swing of `speed` v at w [rad/s] gains and loses up to 4 v/w sin^3(w T/2). A rigid handle of 0.25 kg would need
-        66 N for 0.5 m/s at 84 Hz, but a motor may swing so on its transmission. A handle at a stop only loses speed.
+        `path` has four displacements (m,) [m], with `gaps` [ticks] between them. A counting error leaves a pulse of the
+        mean speed between two positions. Its size is the smaller of the speeds gained and lost, times the middle gap. A
+        handle that reaches a stop only loses speed. `largest_pulse` explains which pulses a real motion can have.
         """
+        p, q, r = gaps
         for i, (a, b, c, d, allowed) in enumerate(zip(*path, most, strict=True), start=1):
-            gained, lost = c - 2 * b + a, d - 2 * c + b
-            if gained * lost < 0 and not (jump := min(abs(gained), abs(lost))) <= allowed:
-                limit = f"no force can move it by {1e3 * allowed:.3g} mm in one tick"
+            gained, lost = (c - b) / q - (b - a) / p, (d - c) / r - (c - b) / q
+            if gained * lost < 0 and not (jump := q * min(abs(gained), abs(lost))) <= allowed:
+                limit = f"no force can move it by {1e3 * allowed:.3g} mm in {'one tick' if q == 1 else f'{q} ticks'}"
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * jump:.3g} mm: {limit} and stop it in the next")
 
     def check_speed(self, x: Sequence[float], before: Sequence[float], seconds: float) -> None:
@@ -234,6 +236,25 @@ class SafetyLimits:
             cap=tuple(map(min, info.hard_limit, most)),
             slew=tuple(slew),
         )
+
+
+@lru_cache(maxsize=4096)
+def largest_pulse(gaps: tuple[int, int, int], T: float, push: float, mode: float, speed: float) -> float:
+    """Return the largest pulse [m] (`SafetyLimits.check_jolt`) of a real motion over `gaps` [ticks] of T [s] each.
+
+    Mean speeds over p and q ticks differ by at most A (p + q)/2 under an acceleration up to A, here `push` [m/tick^2].
+    A motor may also swing on its transmission with the amplitude `speed` v [m/s] at frequencies w [rad/s] up to `mode`.
+    The mean speed over n ticks then is v sinc(n w T/2) times the phase of their middle. A rigid device (its `mode` is
+    infinite) swings less than a push explains: 0.25 kg would need 66 N for 0.5 m/s at 84 Hz.
+    """
+    p, q, r = gaps
+    forced, swing = q * (min(p, r) + q) / 2 * push, 0.0
+    if mode < math.inf:
+        angle = np.linspace(0.0, min(mode * T, math.pi), 65)[1:] / 2  # w T/2
+        first, middle, last = (np.sin(n * angle) / (n * angle) for n in gaps)
+        turned = first * np.exp(-1j * (p + q) * angle) + last * np.exp(1j * (q + r) * angle)
+        swing = float(q * T * speed * np.abs(middle - turned / 2).max())
+    return max(forced, swing)
 
 
 class Heat:

@@ -1,5 +1,6 @@
 """Sessions find devices that disobey or whose ticks do not last T, and accuse none that obeys over a bad line."""
 
+import re
 from contextlib import nullcontext
 
 import numpy as np
@@ -174,6 +175,19 @@ def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
         send(Phase.ARMED, counts=(jumped, 0))
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith("encoder 1 jumped by 0.3 mm: no force can move it by 0.1")
+
+
+@pytest.mark.parametrize(("lost", "ticks"), [(5, "2 ticks"), (6, "2 ticks"), (7, "one tick")])
+def test_jumps_beside_lost_states_stop_sessions(scenario, rungs, lost, ticks):
+    """A handle moves at 0.2 m/s, and its encoder jumps by 2 mm in tick 6. The STATE of a tick beside it is lost."""
+    session, send = hand_driven(scenario, rungs, tested=True)
+    session.drive._commands = None  # this device applies no forces
+    for k in [k for k in range(9) if k != lost]:
+        gap = 1 + (k == lost + 1)
+        send(Phase.ARMED, ticks=gap, lasts=gap * T_US, counts=(240 * k + 2000 * (k > 5), 0))
+    assert session.stage == Stage.STOPPED
+    told = r"encoder 1 jumped by 2 mm: no force can move it by 0\.\d+ mm in "
+    assert re.match(told + ticks, session.cause), session.cause
 
 
 @pytest.mark.parametrize("axis", [0, 1])

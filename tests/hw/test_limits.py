@@ -15,6 +15,7 @@ from haptic_loop.hw.limits import (
     Stage,
     Units,
     _wire_time,
+    largest_pulse,
     probe_delay,
     watchdog_for,
 )
@@ -265,21 +266,55 @@ def test_force_steps_obey_the_slew_limit():
 def test_counting_errors_are_no_motion():
     """A mass can start, stop or bounce within a tick, but not start and stop within two."""
     jump, most = 1.1e-3, (1e-3,)
-    for path in (
-        (0, jump, 2 * jump, 3 * jump),
-        (0, jump, jump, jump),
-        (jump, 0, jump, 2 * jump),
-        (0, 0, 0.9e-3, 0.9e-3),
+    for path, gaps in (
+        ((0, jump, 2 * jump, 3 * jump), (1, 1, 1)),
+        ((0, jump, jump, jump), (1, 1, 1)),
+        ((jump, 0, jump, 2 * jump), (1, 1, 1)),
+        ((0, 0, 0.9e-3, 0.9e-3), (1, 1, 1)),
+        ((0, jump, 3 * jump, 4 * jump), (1, 2, 1)),
+        ((0, 0.9e-3, 0.9e-3, 0.9e-3), (2, 1, 1)),
     ):
-        LIMITS.check_jolt([(x,) for x in path], most)
-    for path in ((0, 0, jump, jump), (jump, 0, 0, -jump), (0, jump, 0, jump), (0, jump, 3 * jump, 4 * jump)):
+        LIMITS.check_jolt([(x,) for x in path], gaps, most)
+    for path, gaps in (
+        ((0, 0, jump, jump), (1, 1, 1)),
+        ((jump, 0, 0, -jump), (1, 1, 1)),
+        ((0, jump, 0, jump), (1, 1, 1)),
+        ((0, jump, 3 * jump, 4 * jump), (1, 1, 1)),
+        ((0, 0, jump, jump), (1, 2, 1)),
+        ((0, jump, 4 * jump, 5 * jump), (1, 2, 1)),
+        ((0, 0, jump, jump), (3, 1, 2)),
+    ):
         for sign in (1, -1):
+            limit = "one tick" if gaps[1] == 1 else "2 ticks"
             with pytest.raises(
-                SafetyStop, match=r"encoder 1 jumped by .* mm: no force can move it by 1 mm in one tick"
+                SafetyStop, match=f"encoder 1 jumped by .* mm: no force can move it by 1 mm in {limit} and"
             ):
-                LIMITS.check_jolt([(sign * x,) for x in path], most)
+                LIMITS.check_jolt([(sign * x,) for x in path], gaps, most)
     with pytest.raises(SafetyStop, match=r"encoder 2 jumped by 1\.1 mm"):
-        LIMITS.check_jolt([(0.0, x) for x in (0, 0, jump, jump)], most * 2)
+        LIMITS.check_jolt([(0.0, x) for x in (0, 0, jump, jump)], (1, 1, 1), most * 2)
+
+
+@pytest.mark.parametrize("gaps", [(1, 1, 1), (1, 2, 1), (2, 1, 1), (1, 1, 3), (3, 2, 1), (5, 1, 4), (2, 5, 2)])
+def test_pulses_of_real_motions_stay_below_limits(gaps):
+    """Swings of any phase, and a force that reverses at any time, are sampled at four instants."""
+    instants = T * np.array([0, gaps[0], gaps[0] + gaps[1], sum(gaps)])
+
+    def largest(motions):
+        (v1, v2, v3), q = np.diff(motions, axis=-1).T / np.reshape(gaps, (3, 1)), gaps[1]
+        gained, lost = v2 - v1, v3 - v2
+        return float((q * np.minimum(abs(gained), abs(lost)))[gained * lost < 0].max())
+
+    speed, phases = 0.7, np.linspace(0, 2 * np.pi, 721)[:, None]
+    for w in (300.0, 800.0, 1500.0):
+        limit = largest_pulse(gaps, T, 0.0, w, speed)
+        assert largest(speed / w * np.sin(w * instants + phases)) <= limit * (1 + 1e-9)
+    assert largest_pulse((1, 1, 1), T, 0.0, 800.0, speed) == pytest.approx(
+        4 * speed / 800 * math.sin(0.4 * T * 1e3) ** 3
+    )
+    push, times = 20 / 0.25, np.linspace(instants[0], instants[-1], 481)[:, None]  # [m/s^2]
+    reversed_force = push * (instants**2 / 2 - np.maximum(instants - times, 0) ** 2)
+    limit = largest_pulse(gaps, T, push * T**2, math.inf, speed)
+    assert 0.3 * limit < largest(reversed_force) <= limit * (1 + 1e-9)
 
 
 # every check, on every channel and for both signs
