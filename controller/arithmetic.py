@@ -80,7 +80,7 @@ def units_since(before: int) -> float:
 def within(
     units: float,
     what: str = "exact arithmetic",
-    why: str = "too many digits over many states",
+    why: str = "too many digits or states",
     clock: Callable[[], bool] | None = None,
 ) -> Iterator[None]:
     """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
@@ -132,7 +132,7 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 def _blas() -> ThreadpoolController:
     """Return a controller of the BLAS libraries of NumPy and SciPy, which must be loaded to be controlled.
 
-    With OPENBLAS_NUM_THREADS=1 SciPy's library uses one thread anyway, so that it need not be loaded.
+    With OPENBLAS_NUM_THREADS=1 SciPy's library uses one thread anyway and need not be loaded.
     """
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         compiled("scipy.linalg._flapack")

@@ -263,9 +263,8 @@ class EnergyBudget(_Net):
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
             return
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
-        before = (
-            self._last[1] if self._last[0] == tick - 1 else -acted
-        )  # If the previous force is unknown, assume -acted, which costs most.
+        # If the previous force is unknown, assume -acted, which costs most.
+        before = self._last[1] if self._last[0] == tick - 1 else -acted
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:
@@ -280,9 +279,10 @@ class EnergyBudget(_Net):
         """Return the largest s (nsim,) for which W is at least the reserve including the packet s f, f = `wanted`.
 
         Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is the pair's present
-        reserve, r = T f^2/(4 delta'), and b = 2 q |f|. Let room be the part of W that is not reserved yet. The reserves
-        are within W if and only if every set of pairs has sum (s^2 r + s b) <= room + sum M, both sums over the set. It
-        is enough to check the first n pairs, for every n, in the order of the s at which s^2 r + s b exceeds M.
+        reserve, r = T f^2/(4 delta'), and b = 2 q |f| with the encoder step q. Let room be the part of W that is not
+        reserved yet. The reserves are within W if and only if every set of pairs has sum (s^2 r + s b) <= room + sum M,
+        both sums over the set. It is enough to check the first n pairs, for every n, in the order of the s at which
+        s^2 r + s b exceeds M.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
         scale, now = np.ones_like(room), self._reserve[self._reached]  # (pairs that the packet reaches, nsim)

@@ -116,7 +116,7 @@ class HeldLine:
         self._held = np.zeros((m, nsim))
 
     def carry(self, k: int, force: Array) -> None:
-        """Replace `force` (m, nsim), sent at tick k, by the force that acts then. Raises ValueError without delays."""
+        """Replace `force` (m, nsim) of tick k by the force that acts. Raises ValueError if tick k has no delays."""
         if k >= self._fresh.shape[0]:
             raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, expected a row for tick {k}, too")
         self._sent[k % self._sent.shape[0]] = force

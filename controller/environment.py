@@ -35,7 +35,7 @@ MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _LEAST_AMOUNT = 1e-12
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
-_MOST_NODES, _MOST_PARTS = 200, 2000  # nodes and springs; a mass has two states, a proof handles a few hundred
+_MOST_NODES, _MOST_PARTS = 200, 2000  # nodes and springs; a mass has two states, and a proof can handle a few hundred
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
@@ -49,7 +49,7 @@ _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice ch
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Scale a direction to length 1. Raises ValueError unless all entries are below 1e9 in size and one above 1e-9."""
+    """Scale a direction to length 1. Raises ValueError unless all sizes are below 1e9 and one is above 1e-9."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
         raise ValueError(f"{field} is {list(direction)}, expected sizes below 1e9, at least one above 1e-9")
     length = float(np.linalg.norm(direction))
@@ -108,7 +108,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def slope(self, T: Number) -> Number:
-        """Return K + 2 B/T [N/m], the largest stiffness of the wall for alternating motions, in the arithmetic of T."""
+        """Return K + 2 B/T [N/m], the wall's stiffness at z = -1, where it is largest, in the arithmetic of T."""
         return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
@@ -529,7 +529,7 @@ def environment(network: Network, T: Number) -> Lti:
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. The states are q- and v-, the previous displacements of contacts with dampers or masses, and the
     previous velocities of contacts with masses. The network's block is added to E(z). The arithmetic is that of T.
-    Raises ValueError if an internal node has no mass and nothing holds it, or only the rounding of directions does.
+    Raises ValueError if an internal node has no mass and is held by nothing, or only by the rounding of directions.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
     key = parts, type(T), T  # the type of T decides the arithmetic
@@ -624,7 +624,7 @@ def _check_directions(lengths: Sequence[Sequence[tuple[str, float]]], inner: dic
         moving = np.abs(vectors[:, loose]).max(axis=1) > 1e-3
         shown = ", ".join(name for name, i in inner.items() if moving[i])
         raise ValueError(
-            f"springs and walls at {shown} have almost equal directions, whose rounding alone holds them: "
+            f"springs and walls at {shown} have almost equal directions, so that only rounding holds these nodes: "
             "make the directions equal, or add a spring `along` each free direction"
         )
 

@@ -29,7 +29,7 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 # coupling respond within the tick: y = y_free - D p, where y_free is y for p = 0, and -D is the feedthrough. The forces
 # solve the linear complementarity problem
 #
-#         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
+#         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p' s = 0,
 #
 # which has exactly one solution, since D is positive semidefinite for a passive environment and coupling.
 
@@ -80,7 +80,7 @@ class Law(ReadOnly):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        """The pair (row of [f; z+], bound [N]) of each limited force. Within these bounds the limiter changes none."""
+        """The pair (row of [f; z+], bound [N]) of each limited force. Within these bounds no force is changed."""
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:

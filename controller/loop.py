@@ -108,6 +108,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     unit: PositionUnit = "m"  # unit of positions; with "rad" N m, N m s/rad and kg m2 replace N, N s/m and kg
 
     def __post_init__(self) -> None:
+        if not 0 < self.T < float("inf"):
+            raise ValueError(f"T is {self.T:g} s, expected a positive, finite period")
         m = len(self.environment.contacts)
         for name in ("theta", "psi", "lam", "delta"):
             if len(getattr(self, name)) != m:
@@ -116,8 +118,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             steps = getattr(self, name)
             if any(n != int(n) or not 0 <= n <= MOST_SAMPLES for n in steps):
                 raise ValueError(f"{name} is {list(steps)}, allowed are whole numbers of samples, 0 to {MOST_SAMPLES}")
-        if any(0 < d < _LEAST_DAMPING for d in self.delta):
-            raise ValueError(f"delta is {list(self.delta)}, expected 0 or at least {_LEAST_DAMPING:g} N s/m")
+        if not all(d == 0 or _LEAST_DAMPING <= d < float("inf") for d in self.delta):
+            raise ValueError(
+                f"delta is {list(self.delta)}, expected 0 or a finite damping from {_LEAST_DAMPING:g} N s/m"
+            )
         if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
         for member in self.members():

@@ -542,12 +542,10 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
 
 
 def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
-    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count or damping."""
+    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
-    if not all(0 <= d < np.inf for d in values):
-        raise ValueError(f"delta is {list(values)}, expected dampings >= 0 in N s/m")
     return values
 
 

@@ -25,10 +25,10 @@ def largest_safe_share(steps: int = 20) -> float:
 
 
 def main() -> None:
-    for name, found in certify(LOOP, SpringDamper(K, B)).items():
-        needed = ", ".join(f"{b:.4f}" for b in found.required)
-        verdict = f"certified ({found.proof})" if found.certified else "not certified"
-        print(f"{name:>11}: needs {needed} of 1.37 N s/m: {verdict}, binds at {found.frequency_hz:.1f} Hz")
+    for name, requirement in certify(LOOP, SpringDamper(K, B)).items():
+        needed = ", ".join(f"{b:.4f}" for b in requirement.required)
+        verdict = f"certified ({requirement.proof})" if requirement.certified else "not certified"
+        print(f"{name:>11}: needs {needed} of 1.37 N s/m: {verdict}, binds at {requirement.frequency_hz:.1f} Hz")
     share = largest_safe_share()
     print(f"this-environment certifies the gains times {share:.4f}: K = {share * K[0]:.0f}, {share * K[1]:.0f} N/m")
 

@@ -5,9 +5,9 @@
     environment= function        the scene, a separate simulation, behind a certified coupling and an energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. A pair of hands grows if hands and devices
-receive, beyond what the devices' damping dissipates, more energy than the 2 mJ of the shell and, with
-environment.world, the energy that gravity and springs released. It shakes if, in the last fifth of the run, a force
+A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. The energy of a pair of hands grows if
+hands and devices receive, beyond what the devices' damping dissipates, more than the 2 mJ of the shell and, with
+environment.world, the energy that gravity and springs released. A pair shakes if, in the last fifth of the run, a force
 changes by more than a tenth of the limit in a tick.
 """
 
@@ -51,7 +51,7 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return peak force [N], share of ticks with a clipped or reduced force, and how many pairs grow and shake."""
+    """Return peak force [N], share of limited ticks, and the numbers of pairs that gain energy and that shake."""
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):
@@ -102,7 +102,7 @@ def scenes(folder):
 
 
 def rows(hands=20, seconds=1.0):
-    """Yield (way, scene, peak force [N], share of limited ticks, pairs that grow, pairs that shake)."""
+    """Yield (way, scene, peak force [N], share of limited ticks, pairs whose energy grows, pairs that shake)."""
     with TemporaryDirectory() as folder:
         for scene, scenario in scenes(folder).items():
             coupling = design_coupling(scenario.loop("I"), "moving-average").coupling
@@ -113,7 +113,7 @@ def rows(hands=20, seconds=1.0):
 
 if __name__ == "__main__":
     hands, seconds = (int(sys.argv[1]), float(sys.argv[2])) if len(sys.argv) > 2 else (20, 1.0)
-    print(f"{'way':24} {'scene':7} {'peak force':>10} {'ticks limited':>14} {'hands grow':>12} {'shake':>10}")
+    print(f"{'way':24} {'scene':7} {'peak force':>10} {'ticks limited':>14} {'energy grows':>12} {'shake':>10}")
     for label, scene, peak, share, grown, shaking in rows(hands, seconds):
         counts = f"{grown:6d} of {hands:2d} {shaking:4d} of {hands:2d}"
         print(f"{label:24} {scene:7} {peak:8.1f} N {100 * share:12.1f} % {counts}")

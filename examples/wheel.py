@@ -34,9 +34,8 @@ def main() -> None:
     hertz = np.geomspace(0.1, 20, 200)
     for rate, style in ((1000, "-"), (360, "--"), (60, "-")):
         game, theta = BASE.replace(T=1 / rate), theta_of(rate)
-        bare = (
-            f"bare, it needs {needed(game):.4f} of 0.1 N m s/rad ({needed(BASE.replace(theta=(theta,))):.4f} by theta)"
-        )
+        at_1_khz = needed(BASE.replace(theta=(theta,)))
+        bare = f"bare, it needs {needed(game):.4f} of 0.1 N m s/rad ({at_1_khz:.4f} at 1 kHz with theta)"
         loop = game.loop("I")
         felt = np.abs(loop.F(design_coupling(loop).coupling).at(np.exp(2j * np.pi * hertz / rate)))[:, 0, 0]
         print(f"{rate:4d} Hz: theta = {theta:2d}; {bare}; coupled, {felt[0]:.2f} of 20 N m/rad are felt")

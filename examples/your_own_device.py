@@ -27,10 +27,10 @@ def main() -> None:
     session = rehearse(scenario, seconds=SECONDS, latch_on_arrival=True)  # False: forces wait for the next tick
     if session.result is None or session.zero_after is None:
         raise InputError(f"no force was ever felt: the session was {session.stage}, {session.cause}")
-    found = session.assessment.requirements["this-environment"]
+    needs = session.assessment.requirements["this-environment"]
     delay, late = 1e6 * (session.delay or 0.0), [1e6 * tau for tau in session.latency or ()]
     print(f"measured: {delay:.0f} us from sample to force; spring-damper for {late[0]:.0f} to {late[1]:.0f} us")
-    print(f"needs {max(found.required):.4f} of {min(found.available):.2f} N s/m: certified = {found.certified}")
+    print(f"needs {max(needs.required):.4f} of {min(needs.available):.2f} N s/m: certified = {needs.certified}")
     print(
         f"a wall of 1000 N/m at 1.2 ms needs {_wall(session.delay):.4f} N s/m, "
         f"and {_wall(None):.4f} N s/m with a delay of one sample"

@@ -55,7 +55,7 @@ class Impedance:
             _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
 
     def changed(self, change: Callable[[_Array], _Array]) -> Impedance:
-        """Return a copy after `change` of A, B, C and D, which indexes or repeats leading axes, without a new check."""
+        """Return a copy, without a new check. `change` indexes or repeats the leading axes of A, B, C and D."""
         changed = object.__new__(Impedance)
         for name in "ABCD":
             _freeze(changed, name, change(getattr(self, name)))
@@ -154,7 +154,7 @@ class Port:
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
-        """Return this port on `axes` axes, repeated on each if it has one. Raises ValueError for another number."""
+        """Return the port on `axes` axes. A port with one axis is repeated. Raises ValueError for other numbers."""
         if self.axes == axes:
             return self
         if self.axes > 1:
@@ -219,7 +219,7 @@ class Port:
 def directions(axes: int) -> _Array:
     """Return directions (axes^2, axes) of springs: e_i + e_j and e_i - e_j for every two axes, then the axes.
 
-    Springs along these directions can add up to any diagonally dominant stiffness matrix, and to no other.
+    Springs along these directions can add up to any symmetric diagonally dominant stiffness matrix, and to no other.
     """
     unit = np.eye(axes)
     skew = [unit[i] + sign * unit[j] for i in range(axes) for j in range(i + 1, axes) for sign in (1, -1)]
@@ -332,7 +332,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
     def __post_init__(self) -> None:
         along = (1.0,) if self.along is msgspec.UNSET else self.along
         if not (any(abs(c) > 1e-9 for c in along) and all(abs(c) < 1e9 for c in along)):
-            raise ValueError(f"along is {list(along)}, expected entries below 1e9 that are not all 0")
+            raise ValueError(f"along is {list(along)}, expected sizes below 1e9, at least one above 1e-9")
         require("amplitude", self.amplitude, 0.0, 1.0, "m")
         require("frequency", self.frequency, 0.0, 100.0, "Hz")
         require("phase", self.phase, -100.0, 100.0, "rad")

@@ -55,8 +55,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 
 _Array = NDArray[np.floating[Any]]
 
-#: MuJoCo's friction lets a held device creep. A device of 0.25 kg under half its friction force creeps at 1e-7 m/s with
-#: these parameters, and at 6e-4 m/s with MuJoCo's defaults.
+#: MuJoCo's friction lets a held device creep. A device of 0.25 kg with 0.3 N of friction, pushed by half of it, creeps
+#: at 1e-7 m/s with these parameters, and at 6e-4 m/s with MuJoCo's defaults.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies
@@ -628,7 +628,7 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes if links have 1 + 2 max(axes)^2 numbers; () for three
+    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes if links have 1 + 2 max(axes)^2 numbers; () if three
     mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_demand, any_environment_per_channel, this_environment
+from asked import any_environment, any_environment_demand, any_environment_per_channel, loop, this_environment
 from scipy.linalg import eig, eigh
 from worlds import FIGURE_4, STIFF, force_map
 
@@ -160,8 +160,14 @@ def test_refusals_say_why():
     assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
         this_environment(default(PUBLISHED["I"]), [1.0])
-    with pytest.raises(ValueError, match="expected dampings >= 0"):
-        this_environment(default(PUBLISHED["I"]), (-1.0, 1.0))
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.inf, np.nan])
+def test_loops_need_finite_periods_and_dampings(wrong):
+    with pytest.raises(ValueError, match=r"delta is .*, expected 0 or a finite damping"):
+        loop(T, (wrong, 1.0))
+    with pytest.raises(ValueError, match=r"T is .* s, expected a positive, finite period"):
+        loop(wrong, DELTA)
 
 
 def test_the_binding_frequency_matches_a_dense_grid():

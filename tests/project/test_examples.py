@@ -43,9 +43,9 @@ SAYS = {
         r"environment.world +block +\d+\.\d N +0.0 % +0 of  2 +0 of  2",
     ],
     "wheel": [
-        r"1000 Hz: theta =  1; bare, it needs 0.0325 .* \(0.0325 by theta\); coupled, 20.00",
-        r" 360 Hz: theta =  4; bare, it needs 0.0671 .* \(0.0700 by theta\); coupled, ",
-        r"  60 Hz: theta = 25; bare, it needs 0.4800 .* \(0.4900 by theta\); coupled, ",
+        r"1000 Hz: theta =  1; bare, it needs 0.0325 .* \(0.0325 at 1 kHz with theta\); coupled, 20.00",
+        r" 360 Hz: theta =  4; bare, it needs 0.0671 .* \(0.0700 at 1 kHz with theta\); coupled, ",
+        r"  60 Hz: theta = 25; bare, it needs 0.4800 .* \(0.4900 at 1 kHz with theta\); coupled, ",
     ],
     "your_own_device": [
         "certified = True",
