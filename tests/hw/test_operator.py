@@ -187,7 +187,7 @@ def test_a_motion_of_another_axis_is_named_twice(x):
     assert check.request is not None
 
 
-def test_the_way_back_from_a_wrong_motion_does_not_count():
+def test_the_way_back_is_no_second_motion():
     """A reversed axis moves back in its measured + direction."""
     answers, check = checked([(-8,), (0,)])
     assert not answers

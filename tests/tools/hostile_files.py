@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import shutil
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from hostile_cases import BUT, SHORT, TEXT, Case, entries, npz, pairs, put, quick, stored, toml, written
+from hostile_cases import BUT, TEXT, Case, entries, npz, pairs, put, quick, stored, toml, written
 
 with_T, LATE = partial(TEXT.replace, "T = 1.2e-3"), TEXT.replace("T = 1.2e-3", "T = 9")
 #: name -> text of a file that is no scenario
@@ -236,22 +235,6 @@ def traces() -> Iterator[Case]:
         yield Case(f"{command}: {name}", (command, "t.npz"), says=r"t\.npz", before=change)
 
 
-#: names that a typesetter, a terminal or a format string would interpret
-STEERING = ("$x^", "$\\frac$", "a_b^c$$", "\U0001f600", "中文", "\u202e", "%s{}", "[red]x[/]", "[/b]", ":smile:")
-STEERING += ("\x1b[31m",)
-
-
-def names_in_pictures() -> Iterator[Case]:
-    """Yield files and a scenario with names of STEERING; a short run has every second file."""
-    for name in STEERING[:: 1 + SHORT]:
-        file = f"t{name}.npz".replace("/", "|")
-        copied = lambda file=file: shutil.copy("t.npz", file)  # noqa: E731
-        yield Case(f"picture of {name!r}", ("trace", file, "--plot", "a.png"), (0,), before=copied)
-    name = "$a^$ \\U0001F600 \\u001b[31m [/b] [red]%s{}"
-    run = ("run", "--case", "none", "--duration", "0.1", "--scenario", "s.toml", "--out", "new")
-    yield Case(f"scenario called {name}", run, (0,), before=toml('"omega-pair"', f'"{name}"'))
-
-
 def cases() -> Iterator[Case]:
-    for part in (scenarios, humans_and_delays, couplings, traces, names_in_pictures):
+    for part in (scenarios, humans_and_delays, couplings, traces):
         yield from part()

@@ -1,12 +1,13 @@
-"""Cases of hostile.py with bad command lines: wrong values and paths, outputs that would replace inputs, .."""
+"""Cases of hostile.py with bad command lines: wrong values and paths, outputs that would replace inputs, names, .."""
 
 from __future__ import annotations
 
 import os
 import shlex
+import shutil
 from collections.abc import Iterator
 
-from hostile_cases import BUT, QUICK, SHORT, TEXT, Case, entries, pairs, quick, written
+from hostile_cases import BUT, QUICK, SHORT, TEXT, Case, entries, pairs, quick, toml, written
 
 NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
 NUMERIC = {
@@ -215,6 +216,22 @@ def combined() -> Iterator[Case]:
         yield Case(f"{command} {line}", words, codes, before=written("h.py", people))
 
 
+#: names that a typesetter, a terminal or a format string would interpret
+STEERING = ("$x^", "$\\frac$", "a_b^c$$", "\U0001f600", "中文", "\u202e", "%s{}", "[red]x[/]", "[/b]", ":smile:")
+STEERING += ("\x1b[31m",)
+
+
+def names_in_pictures() -> Iterator[Case]:
+    """Yield files and a scenario with names of STEERING; a short run has every second file."""
+    for name in STEERING[:: 1 + SHORT]:
+        file = f"t{name}.npz".replace("/", "|")
+        copied = lambda file=file: shutil.copy("t.npz", file)  # noqa: E731
+        yield Case(f"picture of {name!r}", ("trace", file, "--plot", "a.png"), (0,), before=copied)
+    name = "$a^$ \\U0001F600 \\u001b[31m [/b] [red]%s{}"
+    run = ("run", "--case", "none", "--duration", "0.1", "--scenario", "s.toml", "--out", "new")
+    yield Case(f"scenario called {name}", run, (0,), before=toml('"omega-pair"', f'"{name}"'))
+
+
 def cases() -> Iterator[Case]:
-    for part in (numeric_options, odd_paths, overwritten, silence, combined):
+    for part in (numeric_options, odd_paths, overwritten, silence, combined, names_in_pictures):
         yield from part()
