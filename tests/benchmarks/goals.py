@@ -1,11 +1,12 @@
 """Measure speed and error, goal by goal, in one run.
 
-PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
+PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|imports|long|peers ..]
 
-`cold` measures commands to their end, `first` to their first line, `long` commands of many seconds. Times are CPU
-seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of rounds in which the
-compared programs alternate. Commands alternate with the floor, a process that only imports NumPy and MuJoCo; their
-goals are multiples of the floor's time. `--write` puts the table of cold into docs/accuracy.md.
+`cold` measures commands to their end, `first` to their first line, `long` commands of many seconds, and `imports` what
+`python -X importtime` says of the commands of `cold`. Times are CPU seconds; those of cold and first are wall seconds,
+which need an idle machine. Ratios are medians of rounds in which the compared programs alternate. Commands alternate
+with the floor, a process that only imports NumPy and MuJoCo; their goals are multiples of the floor's time. `--write`
+puts the table of cold into docs/accuracy.md.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -94,13 +96,16 @@ def engines() -> Iterator[Sequence[str]]:
         yield *row, f"{np.median(ratios):.2f}", f"{np.median(least):.2f}", f"{position:.1e}", f"{growth:+.1e} 1/s"
 
 
-def started(words: str, folder: str) -> subprocess.Popen[bytes]:
-    """Start the command in a new process, with bytecode and matplotlib's list of fonts, as for a user."""
+def started(words: str, folder: str, *flags: str) -> subprocess.Popen[bytes]:
+    """Start the command in a new process, with bytecode and matplotlib's list of fonts, as for a user.
+
+    `flags` are Python's; with any, the process keeps its standard error.
+    """
     environment = os.environ | {"MPLCONFIGDIR": matplotlib.get_cachedir(), "PYTHONPATH": str(ROOT)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     arguments = ["-c", words[3:]] if words.startswith("-c ") else ["-m", *words.format(*[folder] * 2).split()]
-    call = [sys.executable, *arguments]
-    return subprocess.Popen(call, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    call, said = [sys.executable, *flags, *arguments], subprocess.PIPE if flags else subprocess.DEVNULL
+    return subprocess.Popen(call, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=said)
 
 
 def ended(process: subprocess.Popen[bytes]) -> None:
@@ -189,6 +194,20 @@ def first() -> Iterator[Sequence[str]]:
     yield from interleaved(FIRST, first_line, 5)
 
 
+def imports() -> Iterator[Sequence[str]]:
+    """Yield the seconds of all imports of each command, and of the packages whose modules take longest."""
+    yield "command", "imports [s]", "longest [s]"
+    with tempfile.TemporaryDirectory() as folder:
+        for words in [FLOOR, *COMMANDS]:
+            _, said = started(words, folder, "-X", "importtime").communicate()
+            packages = Counter[str]()  # [us]
+            for own, module in re.findall(r"import time: +(\d+) \| +\d+ \| +(\w+)", said.decode()):
+                packages[module] += int(own)
+            longest = ", ".join(f"{name} {1e-6 * us:.3f}" for name, us in packages.most_common(5))
+            name = words.split(" --out")[0].split(" --json")[0].replace("{}/", "")
+            yield f"`{name}`", f"{1e-6 * packages.total():.2f}", longest
+
+
 def peers() -> Iterator[Sequence[str]]:
     """Run peers.py, which leaves out tools that are not installed."""
     subprocess.run([sys.executable, str(Path(__file__).with_name("peers.py"))], check=True)
@@ -216,7 +235,7 @@ def write(name: str, made: str) -> None:
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (engines, cold, first, long, peers)}
+    known = {f.__name__: f for f in (engines, cold, first, imports, long, peers)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("goals", nargs="*", metavar="|".join(known), help="goals to measure (default: all)")
     parser.add_argument("--write", action="store_true", help="write the table of cold into its page")
