@@ -16,9 +16,9 @@ from haptic_loop.sim.scenario import InputError, require_even_ticks, require_lin
 
 _MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; 3 million take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: error of the growth rate [1/s], with or without coupling (the larger one)",
+    "position: relative rms error; growth: error of the growth rate [1/s], the larger with and without coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
-    "real: simulated seconds per second; *: right, and no setting of its engine is as good in speed and both errors",
+    "real: simulated seconds per second; *: right, and on its engine's Pareto front of speed and both errors",
 )
 
 

@@ -307,9 +307,9 @@ _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
     "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),
     "binds at": lambda r, _: render.optional(r.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda _, m: _stiffest(m.stiffest.K),
-    "delta less by": lambda _, m: _percent(m.sensitivity.delta_error),
-    "T longer by": lambda _, m: _percent(m.sensitivity.T_error),
-    "delay longer by": lambda _, m: render.optional(m.sensitivity.extra_samples, "{:.5g} samples"),
+    "delta may be less by": lambda _, m: _percent(m.sensitivity.delta_error),
+    "T may be longer by": lambda _, m: _percent(m.sensitivity.T_error),
+    "delay may be longer by": lambda _, m: render.optional(m.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 
@@ -359,4 +359,4 @@ def _switching_remarks(switching: SwitchingFigures) -> Iterator[str]:
     needed = f"needs {listed(buffered.required_damping)} N s/m"
     if math.inf in buffered.required_damping:
         needed = "fails with any damping"
-    yield f"A playout buffer to the constant {listed(switching.hi)} {needed}: {enough}."
+    yield f"A playout buffer with the constant delay {listed(switching.hi)} samples {needed}: {enough}."

@@ -40,8 +40,8 @@ def number(name: str, value: Any, expected: str = "a number") -> float:
 def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
     """Raise ValueError unless `value` is one of the allowed words."""
     if not isinstance(value, str) or value not in allowed:
-        given = repr(value) if isinstance(value, str) else shown(value)
-        raise ValueError(f"{name} is {given}, allowed are {', '.join(allowed)}")
+        quoted = repr(value) if isinstance(value, str) else shown(value)
+        raise ValueError(f"{name} is {quoted}, allowed are {', '.join(allowed)}")
 
 
 def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:

@@ -97,7 +97,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
-_SMOOTH = 0.1  # Where the logarithm of the ratio outside the edge is larger, the ratio may jump: no secant is used.
+_SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside it is smaller; else the ratio may jump.
 _NOT_CERTIFIED = "not certified, so there are no margins"
 
 
@@ -303,13 +303,13 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requ
         candidates.append(
             _smaller(
                 lambda x: requirement(loop, coupling.scaled(damping=x), resolved),
-                lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
+                lambda x: f"damper B = {listed([x * b for b in B], 5)} N s/m",
             )
         )
     candidates.append(
         _smaller(
             lambda x: _at_period(loop, coupling, resolved, x * loop.T),
-            lambda x: f"faster: T = {1e3 * x * loop.T:.5g} ms",
+            lambda x: f"period T = {1e3 * x * loop.T:.5g} ms",
         )
     )
     least = 0.9 * needs.ratio
@@ -322,14 +322,14 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
         needs = _varied(loop, coupling, condition, lam=(0,) * loop.channels, **{name: less})
-        tried.append(_Remedy(f"less delay: {name} = {listed(less, 5)}", needs))
+        tried.append(_Remedy(f"delay {name} = {listed(less, 5)}", needs))
         if tried[-1].requirement.certified:
             return tried[-1]
     return min(tried, key=lambda remedy: remedy.requirement.ratio, default=None)
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the remedy of the largest certified factor, rounded down to 0.001, or else of the least requirement."""
+    """Return the remedy with the largest factor that certifies, rounded down to 0.001, else of least requirement."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:

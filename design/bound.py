@@ -214,10 +214,10 @@ class _Dual:
             sums[0, i, j] = value if i == j else 2 * value
         for value, (i, weights) in zip(own[len(triangle) :], self.forbidden, strict=True):
             sums[: len(weights), i] += value * weights
-        return DualMatrix.of(self.grid, self.h(x), 4 / self.loop.T * np.outer(root, root), sums)
+        return DualMatrix.of(self.grid, self.H(x), 4 / self.loop.T * np.outer(root, root), sums)
 
-    def h(self, x: Array) -> Complex:
-        """Return H, not h, at the dual point x, on the grid (k, m, m)."""
+    def H(self, x: Array) -> Complex:
+        """Return H at the dual point x, on the grid (k, m, m)."""
         m, inner = self.loop.channels, self.heights.shape[1]
         parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
         return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
@@ -259,7 +259,7 @@ class _Dual:
         """
         middle, half, response, (size, error) = self._nodes
         low, high = self.band
-        span, H = np.log(high / low), self.h(x).reshape(self.grid.size, -1)
+        span, H = np.log(high / low), self.H(x).reshape(self.grid.size, -1)
         at = lambda w: np.stack([np.interp(w, self.grid, column) for column in H.T], axis=-1)  # noqa: E731
         w, weight = middle[:, None] + half[:, None] * _POINTS, half[:, None] * _WEIGHTS
         inside, G = at(w), response.reshape(*w.shape, -1)

@@ -226,9 +226,9 @@ _MOST_LOST = 1e-4  # largest change of the response by rounding, relative to the
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
-    At the frequencies of a sweep, rounding of a tick and of its coefficients may change the response by at most
-    _MOST_LOST times the larger of two numbers: the largest response and, except in a world, the least delta/T. Terms
-    that cancel and are far larger than the forces increase this change (design.frequency.rounding).
+    At the frequencies of a sweep, the rounding of a tick and of its coefficients must not change the response by more
+    than _MOST_LOST times the larger of two numbers: the largest response and, except in a world, the least delta/T.
+    Terms that are far larger than the forces and cancel increase this change (design.frequency.rounding).
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the feedthrough of V.
@@ -239,12 +239,12 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
         return str(error)
     if running is None or exact is None:
         return "a world needs a coupling with a compliance V"
-    z, meant = on_circle(frequencies(running)), exact.floats()
+    z, rounded = on_circle(frequencies(running)), exact.floats()
     response = running.at(z)
-    if running.A.shape == meant.A.shape:
-        lost = rounding(running, z, meant)
+    if running.A.shape == rounded.A.shape:
+        lost = rounding(running, z, rounded)
     else:  # Rounding has kept a state that cancels in exact arithmetic.
-        lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
+        lost = rounding(running, z) + float(np.abs(response - rounded.at(z)).max())
     scale = max(float(np.abs(response).max()), 0.0 if loop.environment.world else min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
         return None

@@ -197,7 +197,7 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there."""
+    """Return the least s (n,) with H + s diag(0, I) >= 0, where 0 has r rows; inf unless H is > 0 on these rows."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size

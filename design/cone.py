@@ -254,16 +254,16 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
     error: float
     least: float = np.inf
     for _ in range(budgets.CONE_STEPS):
-        missing: _Parts = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
-        wrong = cost - _inner(problem, Z)
+        primal: _Parts = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]  # residuals
+        dual = cost - _inner(problem, Z)
         gap = abs(float(cost @ x) + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))
-        far = max(np.abs(part).max() / size for part in (wrong, *missing))
+        far = max(np.abs(part).max() / size for part in (dual, *primal))
         if (error := max(far, gap / (1 + abs(float(cost @ x))))) < least:
             best, least = x, error
         if not _GAP < error < least / _ENOUGH:
             break
         try:
-            newton = _Newton(problem, S, Z, missing, wrong)
+            newton = _Newton(problem, S, Z, primal, dual)
         except np.linalg.LinAlgError:  # The equations are singular to rounding.
             break
         mu: float = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
@@ -283,13 +283,13 @@ def _moved(parts: _Parts, step: float, change: _Parts) -> _Parts:
 
 
 class _Newton:
-    """The linearised equations at (S, Z), with residuals. Raises LinAlgError if they are singular to rounding."""
+    """The linearised equations at (S, Z) with these residuals. Raises LinAlgError if singular to rounding."""
 
-    def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
-        self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
+    def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, primal: _Parts, dual: Array) -> None:
+        self._problem, self._Z, self._primal, self._dual = problem, Z, primal, dual
         self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
         self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
-        normal = np.zeros((wrong.size, wrong.size))
+        normal = np.zeros((dual.size, dual.size))
         for block, z, inverse in zip(problem.blocks, Z, self._inverse, strict=True):
             slopes = block.slopes.reshape(len(block.slopes), -1)
             turned = (z @ block.slopes @ inverse).reshape(slopes.shape)
@@ -297,16 +297,16 @@ class _Newton:
         self._scale = 1 / np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
         unit = self._scale[:, None] * (normal + normal.T) / 2 * self._scale
         self._lapack = compiled("scipy.linalg._flapack")  # The import of scipy.linalg takes 0.1 s.
-        self._factor, fault = self._lapack.dpotrf(unit + 1e-14 * np.eye(wrong.size), clean=False)
+        self._factor, fault = self._lapack.dpotrf(unit + 1e-14 * np.eye(dual.size), clean=False)
         if fault:
             raise np.linalg.LinAlgError("the equations of a step are singular to rounding")
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
         """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I; `left` is the term dZ dS."""
-        right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
+        right = _inner(self._problem, self._change(self._primal, mu, left)) - self._dual
         dx = self._scale * self._lapack.dpotrs(self._factor, self._scale * right)[0]
-        blocks = zip(self._problem.blocks, self._missing, strict=True)
-        dS = [missing + np.tensordot(dx[list(block.unknowns)], block.slopes, axes=1) for block, missing in blocks]
+        blocks = zip(self._problem.blocks, self._primal, strict=True)
+        dS = [residual + np.tensordot(dx[list(block.unknowns)], block.slopes, axes=1) for block, residual in blocks]
         dZ = self._change(dS, mu, left)
         return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
 

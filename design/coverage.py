@@ -1,4 +1,4 @@
-"""Compute the figures of reports on switching delays (design, audits, sim.switching) and on ranges (design)."""
+"""Compute the figures of reports: requirements under switching delays, requirements and mismatches over ranges."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of `design` over the ranges, after those of `nominal`'s design if `nominal` makes one."""
+    """Return the figures over the ranges of `nominal`'s design without ranges, if it makes one, and of `design`."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

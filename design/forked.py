@@ -83,7 +83,7 @@ class Forked(Generic[_Result]):
             os._exit(code)
 
     def result(self) -> _Result:
-        """Return the function's result, once only."""
+        """Return the function's result; a second call computes it again in this process."""
         if self._process:
             with open(self._reader, "rb") as file:
                 data: Any = file.read()

@@ -121,8 +121,8 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
 
 
 _POINTS_SWEPT = 3000  # approximate number of points in a grid and its refinement
-_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: one response per inputs x states^2, one Schur form per states^3
-_POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep
+_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured time of a response per inputs x states^2, of a Schur form per states^3
+_POINT = 1.5e-6  # [s] measured time of the eigenvalues at a point of a sweep
 
 
 def _sweep_cost(G: Lti) -> float:

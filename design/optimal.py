@@ -31,11 +31,11 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-_SETTLED_DB = 0.05  # [dB] A smaller `_Search.gained` ends the search; in `design` only from _FEWEST_TAPS taps on.
+_SETTLED_DB = 0.05  # [dB] A basis that gains less ends the search; under this-environment only from _FEWEST_TAPS on.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 #: The search ends before a basis of more than 26 taps if the last basis was certified and gained less than 0.1 dB.
 _LARGE, _PROMISING_DB = 26, 0.1
-_FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
+_FEWEST_TAPS = {True: 22, False: 14}  # least number of taps of a basis whose small gain ends the search, by `simply`
 _KEPT_STIFFNESS = 0.5  # A solution is rejected below this share of the static stiffness of an accepted solution.
 _FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's stiffness is dropped.
 # Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
@@ -201,8 +201,8 @@ def _for_known_devices(
     """Return the best coupling under known-device, or under this-environment if that is better.
 
     For fixed beta and fixed multipliers of the facts (design.facts) the block is affine in the forces. The filter over
-    the smallest basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola
-    through the three merits, and the multipliers of the last accepted filter.
+    the smallest basis is designed for three values of beta. A parabola in log beta through their three merits gives the
+    beta of larger bases, which use the multipliers of the last accepted filter.
 
     Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
@@ -257,7 +257,7 @@ class _Search:
     loop: Loop
     options: program.Options
     cases: tuple[program.Case, ...]  # the loop's nominal environment, then the vertices of its ranges
-    bare: float  # largest share of the damping that an environment needs without a coupling
+    bare: float  # required over available damping without a coupling, in the worst environment
     started: float  # clock time [s] of the start, for the report and for --seconds
     spent: int  # counted work at the start
     condition: Condition = THIS_ENVIRONMENT  # the condition that judges and proves couplings

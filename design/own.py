@@ -16,8 +16,8 @@ from haptic_loop.design import forked
 from haptic_loop.design.files import InputError
 
 _Made = TypeVar("_Made")
-_HOME, _WORLDS = Path(__file__).parents[1], ("haptic_loop", "models", "controller", "design", "sim", "hw", "cli")
-_OURS = tuple(f"{_HOME / world}{os.sep}" for world in _WORLDS)
+_HOME, _FOLDERS = Path(__file__).parents[1], ("haptic_loop", "models", "controller", "design", "sim", "hw", "cli")
+_OURS = tuple(f"{_HOME / folder}{os.sep}" for folder in _FOLDERS)
 #: beginnings of the names of files that are not a user's own, such as "<string>"
 _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 

@@ -44,7 +44,7 @@ from haptic_loop.design.transparency import BAND_HZ
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
 _BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
-_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # largest and least distances of the real poles to 1
+_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # largest and least distance of real poles to 1, by basis
 _FASTER = 0.25  # With many channels, real modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
@@ -356,7 +356,7 @@ class Problem:
     cases: tuple[Case, ...]
     options: Options
     soft: float  # weight of the force above 100 Hz
-    heavier: float = 1.0  # factor of the static stiffness's weight
+    heavier: float = 1.0  # factor on the weight of the static stiffness
 
     @property
     def own(self) -> list[tuple[int, int]]:

@@ -94,9 +94,8 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return `robustness`, or None if it does not apply.
 
-    It does not apply if the condition holds in any environment, is not evaluated for varied loops (`not_varied`) or
-    does not cover the loop, to walls, blocks E(z) and other environments than networks, and to values that are too
-    large when increased by ten percent.
+    It applies to networks without walls and blocks E(z), whose values may be increased by ten percent. The condition
+    must cover the loop, be evaluated for varied loops (`not_varied`), and not hold in any environment.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None

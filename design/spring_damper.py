@@ -201,7 +201,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return _gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
-_SETTLED = 1e-6  # The sequence stops when a step changes the norm by less than this share, and the bound is as close.
+_SETTLED = 1e-6  # The sequence ends if a step changes the norm by a smaller share, and its bound is as near.
 _NEGLIGIBLE = 1e-6  # Dampers below this share of the usable damping become 0, because solvers return 1e-9 for 0.
 
 
@@ -634,7 +634,7 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
     if first < last:
-        inverse = np.linalg.inv(_best_charge(loop, i, theta))
+        inverse = np.linalg.inv(_best_latency_multiplier(loop, i, theta))
     windows = np.array([np.ones(theta + 2), [*np.ones(theta + 1), 0.0]])
     pairs = [(a, b) for a in (0, 1) for b in (0, 1)]
     terms = [inverse[a, b] * np.correlate(windows[a], windows[b], "full")[theta + 1 :] for a, b in pairs]
@@ -659,7 +659,7 @@ def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
     return terms
 
 
-def _best_charge(loop: Loop, i: int, theta: int) -> Array:
+def _best_latency_multiplier(loop: Loop, i: int, theta: int) -> Array:
     """Return the Q (2, 2) [1/s] that minimises trace(Q^-1 M), where M holds the inner products of l in `_late_chi`."""
     hands, scale = Latency(), 1 / loop.T
     root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))

@@ -228,11 +228,11 @@ def test_figures_that_do_not_exist_have_a_reason():
 
 def test_remedies_are_evaluated_and_no_larger_than_needed():
     subject = wall(5000, 0.5, 1)
-    changes = {r.change.split(":")[0]: r for r in _remedies(*subject, "this-environment")}
-    assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
-    assert not changes["less delay"].requirement.certified
-    assert changes["faster"].requirement.certified
-    assert changes["faster"].requirement.required[0] > 0.98 * 1.37
+    changes = {r.change.split(" ")[0]: r for r in _remedies(*subject, "this-environment")}
+    assert changes["delay"].requirement.required[0] == pytest.approx(3.0)
+    assert not changes["delay"].requirement.certified
+    assert changes["period"].requirement.certified
+    assert changes["period"].requirement.required[0] > 0.98 * 1.37
     assert _remedies(*wall(500, 0), "this-environment") == []
     assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 

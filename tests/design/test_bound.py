@@ -123,7 +123,7 @@ def test_the_integral_errs_by_less_than_its_bound(name, high):
     dual = module._Dual.of(loop, (1.0, high), 16)
     x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)
     found, error = dual.objective_again(x)
-    E, H, span = loop.E(), dual.h(x), np.log(min(high, 0.5 / loop.T))
+    E, H, span = loop.E(), dual.H(x), np.log(min(high, 0.5 / loop.T))
     total, wrong = 0.0, 0.0
     for a, b, left, right in zip(dual.grid[:-1], dual.grid[1:], H[:-1], H[1:], strict=True):
         share = np.linspace(0, 1, 401)[:, None, None]
@@ -207,7 +207,7 @@ def test_a_full_level_enters_the_dual_value():
     z = np.exp(1j * w)
     S = hermitian(np.array(LEVEL) + PLANE.T * F.at(z) / (z - 1)[:, None, None])
     D = dual.matrix(x).at(np.append(0.0, w)) / np.outer(root, root)
-    H = np.stack([np.interp(w, dual.grid, each, left=0, right=0) for each in dual.h(x).reshape(-1, 4).T], axis=-1)
+    H = np.stack([np.interp(w, dual.grid, each, left=0, right=0) for each in dual.H(x).reshape(-1, 4).T], axis=-1)
     mass = np.trace(D[0].real @ F.dc()) * PLANE.T / 2
     product = np.trapezoid((np.conj(D[1:]) * S).real.sum(axis=(1, 2)), w) / np.pi + mass
     forces = 2 / np.pi * np.trapezoid((np.conj(H.reshape(-1, 2, 2)) * F.at(z)).real.sum(axis=(1, 2)), w)
