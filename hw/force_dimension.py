@@ -10,8 +10,9 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stderr
 from importlib import import_module
+from io import StringIO
 from typing import Any, Self
 
 from haptic_loop.hw import protocol as wire
@@ -25,6 +26,7 @@ _PACKAGE = "forcedimension_core"
 _SATURATED = 2  # setForce returns this code when the motors cannot give the force
 _WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new force comes in this time
 _SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
+_COUNTS = 2**31  # a position in counts fits into 32 bits
 _SHORTEST = 0.75  # after a late tick, the next tick comes no earlier than this share of T
 
 
@@ -42,11 +44,13 @@ class _Library:
 
 def library() -> Any:
     """Load the package, which needs the maker's library. Raises InputError if either is missing."""
+    said = StringIO()
     try:
-        return _Library()
+        with redirect_stderr(said):  # The package writes why it cannot load the maker's library.
+            return _Library()
     except ImportError as error:
         what = f"the Python package {_PACKAGE} and Force Dimension's SDK (https://www.forcedimension.com)"
-        raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {error}") from None
+        raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {said.getvalue() or error}") from None
 
 
 class ForceDimension:
@@ -179,8 +183,14 @@ class ForceDimension:
         places = {index: [0.0, 0.0, 0.0] for index in self._ids}
         for index, ID in self._ids.items():
             self._heeded(self._sdk.getPosition(places[index], ID=ID))
-        steps = zip(self._where, self._info.encoder_step, strict=True)
-        return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
+        counts = []
+        for (index, axis), step in zip(self._where, self._info.encoder_step, strict=True):
+            count = places[index][axis] / (1e-12 * step)
+            if not abs(count) < _COUNTS:  # also true for nan
+                place = f"{'xyz'[axis]} = {places[index][axis]:g} m"
+                raise wire.SafetyStop(f"device {index} reports the position {place}")
+            counts.append(round(count))
+        return tuple(counts)
 
     def _strongest(self, config: wire.Config, index: str) -> float:
         """Return the length [N] of the largest force that a device may have to make, plus 1 % for rounding."""

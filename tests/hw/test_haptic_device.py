@@ -275,6 +275,27 @@ def test_a_device_that_is_unplugged_is_lost(scenario):
     assert sdk.force.tolist() == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("place", [np.nan, np.inf, 1e300])
+def test_impossible_positions_stop_the_session(scenario, monkeypatch, place):
+    sdk, lost = StandIn(scenario), []
+    known = sdk.getPosition
+
+    def position(out, ID):
+        known(out, ID)
+        if lost and ID == 1:
+            out[0] = place
+        return 0
+
+    monkeypatch.setattr(sdk, "getPosition", position)
+
+    def watch(session):
+        lost[:] = [session.stage] * (session.stage == Stage.ARMED) or lost
+
+    session, *_ = held_session(scenario, sdk, watch=watch, own=SOFT)
+    assert (session.stage, session.cause) == (Stage.STOPPED, f"device 1 reports the position x = {place:g} m")
+    assert sdk.force.tolist() == [0.0, 0.0]
+
+
 def test_saturated_motors_are_device_faults(scenario):
     """The force of a saturated motor is not the certified one."""
     sdk = StandIn(scenario)
@@ -324,21 +345,24 @@ def test_a_missing_library_gives_one_line(monkeypatch):
     assert "\n" not in str(error.value)
 
 
-def test_the_package_without_the_makers_sdk_says_so(monkeypatch):
-    """The package is installed and raises, as it does without libdrd."""
+@pytest.mark.parametrize("written", ["", "Could not find libdrd. Is it installed?\n"])
+def test_the_package_without_the_makers_sdk_says_so(monkeypatch, capsys, written):
+    """The package is installed, writes a line and raises, as it does without libdrd."""
 
     class Finder:
         @staticmethod
         def find_spec(name, path=None, target=None):
             if name == "forcedimension_core.dhd":
+                sys.stderr.write(written)
                 raise ImportError("There were problems loading libdrd.")
 
     package = ModuleType("forcedimension_core")
     package.__path__ = []
     monkeypatch.setitem(sys.modules, "forcedimension_core", package)
     monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
-    with pytest.raises(InputError, match=r"SDK .*: There were problems loading libdrd"):
+    with pytest.raises(InputError, match=rf"SDK .*: {written.strip() or 'There were problems loading libdrd'}"):
         library()
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
