@@ -47,7 +47,7 @@ class SerialPort:
             raise InputError(f"--port {path}: {error}") from None
         with suppress(Exception):  # some drivers lack it; on FTDI chips it sets the latency timer from 16 to 1 ms
             self._serial.set_low_latency_mode(True)
-        self._fd = self._serial.fileno()
+        self._path, self._fd = path, self._serial.fileno()
 
     def fileno(self) -> int:
         return self._fd
@@ -66,9 +66,9 @@ class SerialPort:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise PortLost(f"the port cannot be read: {error}") from None
+            raise PortLost(f"port {self._path} cannot be read: {error}") from None
         if not data:
-            raise PortLost("the port cannot be read: it was hung up")
+            raise PortLost(f"port {self._path} cannot be read: it was hung up")
         return data
 
     def write(self, data: bytes) -> int:
@@ -78,14 +78,14 @@ class SerialPort:
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise PortLost(f"the port cannot be written: {error}") from None
+            raise PortLost(f"port {self._path} cannot be written: {error}") from None
 
     def discard(self) -> None:
         """Discard the bytes that have come. Raises PortLost."""
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
-            raise PortLost(f"the port is gone: {error}") from None
+            raise PortLost(f"port {self._path} is gone: {error}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -196,9 +196,9 @@ class Live(Driver):
         if self.signals and signal.SIGUSR1 in self.signals:
             self.do(session.estop("SIGUSR1", now))
         elif self.signals:
-            name = signal.Signals(self.signals[0]).name
-            again = len(self.signals) > 1
-            self.do(session.end(Stage.STOPPED, f"{name} again", now) if again else session.stop(name, now))
+            first, *more = (signal.Signals(number).name for number in self.signals)
+            cause = f"{first}, then {more[0]}" if more else first
+            self.do(session.end(Stage.STOPPED, cause, now) if more else session.stop(cause, now))
         if now - self._watched > 100_000:
             self._watched = now
             self._watch(session)
