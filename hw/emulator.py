@@ -385,10 +385,21 @@ class Emulator:
     def _in_counts(self, fault: FaultInjection) -> int:
         return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
 
-    def _broken(self, fault: FaultInjection) -> Callable[[Any], Any]:
-        """Return how a motor or an encoder that breaks now changes a force [N] or a count."""
-        step, value = self.info.encoder_step[fault.axis], fault.value
-        now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
+    def _also(self, fault: FaultInjection, earlier: Callable[[int], int]) -> Callable[[int], int]:
+        """Return how an encoder with `earlier` faults changes a count if it also breaks in the present tick."""
+        broken = None
+
+        def shown(n: int) -> int:
+            nonlocal broken
+            n = earlier(n)
+            broken = broken or self._broken(fault, n)
+            return broken(n)
+
+        return shown
+
+    def _broken(self, fault: FaultInjection, now: int) -> Callable[[Any], Any]:
+        """Return how a motor or an encoder that breaks at the count `now` changes a force [N] or a count."""
+        step, value, most = self.info.encoder_step[fault.axis], fault.value, self._in_counts(fault)
         match fault.kind:
             case "motor":
                 return lambda force: value * force
@@ -473,10 +484,9 @@ class Emulator:
                 case "letgo":
                     self.device.deadman = False
                 case kind if kind in _MOTOR:  # A later fault of the same kind replaces the earlier one.
-                    self._motors[fault.axis, kind] = self._broken(fault)
+                    self._motors[fault.axis, kind] = self._broken(fault, 0)
                 case kind if kind in _AXIS:  # all other faults of one axis break its encoder, one after the other
-                    earlier, broken = self._encoders.get(fault.axis, int), self._broken(fault)
-                    self._encoders[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
+                    self._encoders[fault.axis] = self._also(fault, self._encoders.get(fault.axis, int))
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:

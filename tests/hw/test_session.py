@@ -448,6 +448,18 @@ def test_wrong_faults_are_refused_in_one_line(text, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("second", "shown"), [("freeze", [300, 300]), ("toggle", [300, 301]), ("late=1", [300, 300])])
+def test_second_faults_change_counts_of_the_first(scenario, second, shown):
+    """The encoder shows thrice the true counts when it breaks again, at 100 true counts."""
+    emulator = Emulator(scenario, tuple(map(FaultInjection.parse, ("scale=3", second))))
+    counts, tick = [], emulator.device.tick
+    emulator.device.tick = lambda now, seen: (counts.append(seen[0]), tick(now, seen))[1]
+    for k, true in enumerate((100, 101)):
+        emulator.plant.s[0] = true * emulator.plant.encoder_step[0]
+        emulator.tick(1200 * k)
+    assert counts == shown
+
+
 @pytest.mark.slow
 def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
     """With caps of 0.3 and 0.2 N, the limiter keeps forces within the caps and acts in over a third of the ticks."""
