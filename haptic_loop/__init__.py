@@ -21,12 +21,13 @@ start quickly.
 
 from __future__ import annotations
 
+# `signal` imports enum, and Ctrl-C in this time would print a traceback.
+import _signal  # pyright: ignore[reportMissingImports]
 import os
-import signal
 import sys
 from importlib import import_module
 
-TYPE_CHECKING = False  # Importing it from typing takes time; Ctrl-C in this time would print a traceback.
+TYPE_CHECKING = False  # Importing it from typing takes time, as above.
 if TYPE_CHECKING:
     from typing import Any, NoReturn
 
@@ -108,8 +109,8 @@ def _leave(number: int, frame: Any) -> NoReturn:
 # takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute restores this handler
-        signal.signal(signal.SIGINT, _leave)
+    if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # cli.execute restores this handler
+        _signal.signal(_signal.SIGINT, _leave)
 
 
 def __getattr__(name: str) -> Any:
