@@ -243,11 +243,10 @@ def hold_session(
     `alone` is the emulated device's scenario if it is not that of the options; `coulomb` [N] is its dry friction.
     """
     with ExitStack() as stack:
-        incidents = IncidentLog(out / "incidents.jsonl")
-        incidents.attach(session)
         if args.rehearse:
-            return _rehearsed(args, session, plan, seconds, incidents, alone, coulomb)
+            return _rehearsed(args, session, plan, seconds, out, alone, coulomb)
         device = _device(args, session, stack)
+        incidents = _logged(session, out)
         if args.port and not args.no_preflight:
             with progress("looking at this machine"):
                 problems = preflight(_ports(args))
@@ -280,6 +279,13 @@ def hold_session(
         stack.callback(_clear)
         live.run()
     return _Held(live.signals, device.dropped if isinstance(device, SerialDevice | Boards) else 0)
+
+
+def _logged(session: Session, out: Path) -> IncidentLog:
+    """Return the incident log of a session whose device is open: a missing port leaves no file."""
+    incidents = IncidentLog(out / "incidents.jsonl")
+    incidents.attach(session)
+    return incidents
 
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
@@ -320,7 +326,7 @@ def _rehearsed(
     session: Session,
     plan: Callable[[Ages], Sequence[Armable]],
     seconds: float,
-    incidents: IncidentLog,
+    out: Path,
     alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
@@ -328,6 +334,7 @@ def _rehearsed(
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     with options.refused("the scenario cannot run behind a serial link: "):
         emulator = Emulator(axis_by_axis(alone or options.scenario_from(args)), faults, coulomb=coulomb)
+    incidents = _logged(session, out)
     with progress("rehearsing") as move:
 
         def planned(ages: Ages) -> Sequence[Armable]:

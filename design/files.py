@@ -16,7 +16,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from math import prod
@@ -77,6 +77,7 @@ class _Ledger:
     read: dict[Any, str] = field(default_factory=dict)  # place -> name of the file in messages
     named: dict[Any, str] = field(default_factory=dict)  # place -> option that names the file as output
     written: set[Any] = field(default_factory=set)  # places of the files that the command has written
+    folders: list[Path] = field(default_factory=list)  # folders that the command has created, the deepest first
 
 
 _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
@@ -84,12 +85,15 @@ _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
 
 @contextmanager
 def one_command() -> Iterator[None]:
-    """Begin a new record of the files that a command reads and writes."""
-    token = _ledger.set(_Ledger())
+    """Begin a new record of the files that a command reads and writes. At its end remove new folders without files."""
+    token = _ledger.set(ledger := _Ledger())
     try:
         yield
     finally:
         _ledger.reset(token)
+        for path in ledger.folders:
+            with suppress(OSError):  # The folder is not empty.
+                path.rmdir()
 
 
 def _places(path: Path) -> set[Any]:
@@ -248,7 +252,10 @@ def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
 def folder(path: Path) -> Path:
     """Create a folder if it does not exist. Raises InputError if files cannot be written to it."""
     try:
+        absent = [each for each in (path, *path.parents) if not each.exists()]
         path.mkdir(parents=True, exist_ok=True)
+        if ledger := _ledger.get():
+            ledger.folders[:0] = absent
         _try(path)
     except OSError as error:
         raise InputError(f"--out {path}: {error.strerror or error}") from None

@@ -14,7 +14,7 @@ import pytest
 from haptic_loop.cli.execute import execute
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.coupling_file import Stored, save
-from haptic_loop.design.files import check_file, out_file
+from haptic_loop.design.files import check_file, one_command, out_file
 from haptic_loop.sim import run as loop
 from haptic_loop.sim.scenario import InputError, load
 
@@ -94,10 +94,10 @@ def test_interrupted_references_measure_nothing(simulation, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("scenario", [["--case", "none"], ["--scenario", "world-cube"]])
-def test_no_finished_tick_means_no_report(scenario, tmp_path, monkeypatch):
+def test_no_finished_tick_leaves_no_folder(scenario, tmp_path, monkeypatch):
     interrupt(monkeypatch, 1, blocks=0)
-    with pytest.raises(KeyboardInterrupt):
-        finish(["sim.run", *scenario], tmp_path)
+    with pytest.raises(KeyboardInterrupt), one_command():
+        finish(["sim.run", *scenario], tmp_path / "new/folder")
     assert not list(tmp_path.iterdir())
 
 
@@ -252,6 +252,15 @@ IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise I
 )
 def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
     assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
+
+
+def test_ctrl_c_before_enum_is_imported(tmp_path):
+    """Without site, the package is the first to import enum: its handler must be there by then."""
+    (tmp_path / "enum.py").write_text(INTERRUPT.replace("signal\n", "_signal as signal\n", 1))
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    words = [sys.executable, "-S", "-m", "sim.run"]
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,10 @@ from haptic_loop.cli import bridge, identify, replay
 from haptic_loop.cli.options import Parser
 from haptic_loop.cli.session_cli import add_link_options, check_link
 from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.design.files import one_command
 from haptic_loop.hw.control import certified_coupling
 from haptic_loop.hw.driver import Operator
-from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.protocol import Phase
@@ -200,6 +201,39 @@ def test_signals_end_sessions_while_forces_act(scenario, name, stage):
     assert stages[-3:] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
     at = {event.stage: event.t_us for event in session.log}
     assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) > 0.09  # [s] on the session's clock
+
+
+def test_a_second_signal_names_both(scenario):
+    def watch(session):
+        if session.stage == Stage.ARMED and not live.signals:
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGHUP)
+
+    plan = lambda ages: [certified_coupling(scenario, "I", None, None, 2)]  # noqa: E731
+    rehearsal = rehearsal_of(scenario, ())
+    live = Live(rehearsal.session, rehearsal._driver.device, plan, Operator(True, 20.0), watch=watch)
+    live.clock = lambda: round(rehearsal.now)
+    session = live.run()
+    assert (session.stage, session.cause) == (Stage.STOPPED, "SIGTERM, then SIGHUP")
+    assert rehearsal.emulator.device.phase.name.lower() in AT_REST
+
+
+def test_a_lost_port_is_named():
+    master, slave = os.openpty()
+    with SerialPort(path := os.ttyname(slave), None) as port:
+        os.close(master)
+        for call in (port.read, lambda: port.write(b"x")):
+            with pytest.raises(PortLost, match=f"^port {path} cannot be "):
+                call()
+    os.close(slave)
+
+
+@pytest.mark.parametrize("port", ["/nowhere", "force-dimension"])
+def test_a_missing_port_leaves_no_files(port, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "forcedimension_core", None)
+    with one_command(), pytest.raises(InputError, match=f"--port {port}"):
+        bridge.main(["--port", port, "--arm", "--no-dead-man", "--out", str(tmp_path / "a/b")])
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
