@@ -1,4 +1,4 @@
-"""Energy budgets bound the energy that hands get from any controller, and never act in any-environment loops."""
+"""Energy budgets bound the energy of hands for any controller, and never act in any-environment loops."""
 
 from itertools import product
 
@@ -92,7 +92,7 @@ def test_no_hand_is_given_more_than_the_budget():
     rng, n = np.random.default_rng(7), np.arange(240)
     lossless, start = n // 3 % 2 == 0, np.where(n // 6 % 2 == 0, 1e-3, 0.3)
     hands = Hands(rng, n.size, lossless, start)
-    W0, given, theta = 0.05, hands.energy(), (1, 2)
+    W0, initial, theta = 0.05, hands.energy(), (1, 2)
     force, budget = each_in_turn(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=n.size)
     line, x, most = np.zeros((3, 2, n.size)), hands.x, np.zeros(n.size)
     for _ in range(700):
@@ -100,11 +100,11 @@ def test_no_hand_is_given_more_than_the_budget():
         x = hands.x
         assert (budget.energy - budget.reserved > -1e-9).all()
         hands.hold(np.stack([line[n, i] for i, n in enumerate(theta)]))
-        received = hands.energy() - given
-        assert (received <= W0 + 1e-9 * (1 + given)).all()
+        received = hands.energy() - initial
+        assert (received <= W0 + 1e-9 * (1 + initial)).all()
         most = np.maximum(most, received)
     assert budget.limited.min() > 0
-    # some hand receives more than half of the bound
+    # Some hand receives more than half of the bound.
     assert most[(n % 3 == 2) & lossless & (start < 0.1)].max() > 0.5 * W0
 
 
@@ -112,7 +112,8 @@ def test_no_hand_is_given_more_than_the_budget():
 def test_the_budget_holds_on_stiffer_springs():
     """The default scenario's optimal coupling meets springs 2.5 times stiffer, compliant devices and lossless hands.
 
-    With the budget forces give at most what devices dissipate, and hands stay below 0.5 m/s; else most exceed 2 m/s.
+    With the budget, forces give at most what devices dissipate, and hands stay below 0.5 m/s. Without it, most hands
+    exceed 2 m/s.
     """
     scenario, nsim = load(), 30
     coupling = design_coupling(scenario.loop("I"), "optimal", "this-environment").coupling
@@ -161,7 +162,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
     """The budget learns which forces acted at once, four ticks late, or never."""
     rng, nsim = np.random.default_rng(8), 90
     hands = Hands(rng, nsim, True, 0.01)
-    W0, given, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4
+    W0, initial, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4
     budget = EnergyBudget(DELTA, T, Packets(lo, hi, hold), start=W0, nsim=nsim)
     line, force, x, acted = (
         Line(rng, lo, hi, hold, loss, nsim),
@@ -176,7 +177,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
             budget.tell(k - late, acted[k - late + 1])
         acted.append(line.carry(sent))
         hands.hold(acted[-1])
-        assert (hands.energy() - given).max() <= W0 + 1e-9
+        assert (hands.energy() - initial).max() <= W0 + 1e-9
         assert (budget.energy - budget.reserved > -1e-9).all()
     assert budget.surprises == 0
     # If the budget never learns which forces acted, it stays empty for some hands; most hands get forces.
@@ -185,12 +186,12 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
 
 @pytest.mark.parametrize("told", [pytest.param("constant", marks=pytest.mark.slow), "late"])
 def test_coarse_encoders_keep_the_guarantee(told):
-    """No hand receives more than W0. If the budget ignores steps of 0.5 mm, one gets 1.5 W0 at constant delays."""
+    """No hand receives more than W0. If the budget ignores steps of 0.5 mm, one receives over 1.5 W0."""
     W0, q, most = 0.05, 5e-4, {}
     for known in (q, 0.0) if told == "constant" else (q,):
         rng = np.random.default_rng(17)
         hands = Hands(rng, 40, True, 0.02)
-        given, steal = hands.energy(), thief(hands.x, rng)
+        initial, steal = hands.energy(), thief(hands.x, rng)
         lo, hi = ((0, 1), (0, 1)) if told == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, Packets(lo, hi), encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
@@ -203,7 +204,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
             seen = now
             acted.append(line.carry(sent))
             hands.hold(acted[-1])
-            most[known] = max(most.get(known, 0.0), (hands.energy() - given).max())
+            most[known] = max(most.get(known, 0.0), (hands.energy() - initial).max())
         assert np.abs(acted).sum() > 0
     assert most[q] <= W0 + 1e-9
     if told == "constant":
@@ -240,7 +241,7 @@ def test_encoder_errors_cost_their_worst_combination(told):
 def test_reserve_and_scale_match_brute_force():
     """By definition the reserve sums over the next ticks the largest loss of a packet of an allowed age.
 
-    A scaled force could not be larger by 1e-4 of the wanted force without a reserve above the energy.
+    If a scaled force were larger by 1e-4 of the wanted force, the reserve would exceed the energy.
     """
     rng = np.random.default_rng(9)
     cases = (((0, 0), (0, 0), 0, 0), ((1, 2), (1, 2), 0, 0), ((0, 1), (4, 2), 0, 0), ((1, 0), (2, 3), 2, 1e-5))
@@ -285,7 +286,7 @@ def motions(rng, ticks, nsim):
     return x
 
 
-def acted_on(F, x, theta, delta, **options):
+def limited_ticks(F, x, theta, delta, **options):
     """Return the numbers (nsim,) of ticks in which the budget limits the undelayed forces of F for motions x."""
     budget, z = EnergyBudget(delta, F.T, Packets(theta), nsim=x.shape[2], **options), np.zeros((F.order, x.shape[2]))
     for k, now in enumerate(x):
@@ -305,9 +306,9 @@ def test_any_environment_loops_are_never_limited():
     for net in (FIGURE_4, stiff):
         E = environment(net, T)
         options = {"start": 1e-12}  # [J] covers rounding
-        assert acted_on(coupling.around(E), x, (1, 2), scenario.delta, **options).max() == 0
+        assert limited_ticks(coupling.around(E), x, (1, 2), scenario.delta, **options).max() == 0
     beyond = SpringDamper(1.5 * coupling.K, 1.5 * coupling.B)
-    assert acted_on(beyond.around(environment(stiff, T)), x, (1, 2), scenario.delta, **options).max() > 0
+    assert limited_ticks(beyond.around(environment(stiff, T)), x, (1, 2), scenario.delta, **options).max() > 0
 
 
 @pytest.mark.parametrize("theta", [0, 2])
@@ -318,15 +319,15 @@ def test_delayed_springs_within_bounds_are_never_limited(theta):
     x = np.concatenate([motions(rng, 400, 60), ramps - ramps[:1]], axis=2)
     inside, beyond = (Lti.constant(np.diag(most * scale), T) for scale in (1 - 1e-9, 1.1))
     options = {"start": 1e-12}
-    assert acted_on(inside, x, (theta, theta), DELTA, **options).max() == 0
-    assert acted_on(beyond, x, (theta, theta), DELTA, **options).max() > 0
+    assert limited_ticks(inside, x, (theta, theta), DELTA, **options).max() == 0
+    assert limited_ticks(beyond, x, (theta, theta), DELTA, **options).max() > 0
 
 
 def test_a_cap_below_stored_energy_limits_most_ticks():
     """A spring of 1000 N/m stores 0.2 J at 2 cm: a cap of 0.25 J limits no tick, a cap of 0.05 J most ticks."""
     x = 0.02 * np.sin(2 * np.pi * 3.0 * T * np.arange(834))[:, None, None]
     spring = Lti.constant([[1000.0]], T)
-    share = {cap: acted_on(spring, x, (0,), [1.37], cap=cap)[0] / len(x) for cap in (0.05, 0.25)}
+    share = {cap: limited_ticks(spring, x, (0,), [1.37], cap=cap)[0] / len(x) for cap in (0.05, 0.25)}
     assert share[0.25] == 0
     assert 0.5 < share[0.05] < 0.8
 
@@ -378,7 +379,7 @@ def test_impossible_budgets_are_refused(changed, message):
         EnergyBudget(**({"delta": [1.0], "T": T, "packets": Packets([1])} | changed))
 
 
-# ---- the shell at the environment's port
+# The shell at the environment's port
 
 
 def active_environment():
@@ -431,20 +432,20 @@ def test_hands_behind_the_shell_get_its_budget():
     for W0, ticks in ((0.02, 2000), (1e9, 3000)):
         rng = np.random.default_rng(18)
         hands, shell = Hands(rng, nsim, True, 0.05), Shell(V, start=W0, nsim=nsim)
-        given, line, z, most[W0] = hands.energy(), np.zeros((3, 2, nsim)), np.zeros((E.order, nsim)), np.zeros(nsim)
+        initial, line, z, most[W0] = hands.energy(), np.zeros((3, 2, nsim)), np.zeros((E.order, nsim)), np.zeros(nsim)
         for _ in range(ticks):
             wanted = solve @ (E.C @ z + E.D @ shell.free(hands.x))
             force, u = shell.limit(np.where(nonsense, 20 * rng.normal(size=(2, nsim)), wanted))
             z = E.A @ z + E.B @ u
             line = np.concatenate([force[None], line[:-1]])
             hands.hold(np.stack([line[1, 0], line[2, 1]]))
-            most[W0] = np.maximum(most[W0], hands.energy() - given)
+            most[W0] = np.maximum(most[W0], hands.energy() - initial)
         assert most[W0].max() <= W0 + 1e-9
     assert most[1e9][~nonsense].max() > 5 * 0.02
     assert most[0.02][~nonsense].max() > 0.1 * 0.02
 
 
-def test_the_shell_leaves_implicit_passive_environments_alone():
+def test_the_shell_never_limits_a_passive_environment():
     rng = np.random.default_rng(14)
     E, V = environment(FIGURE_4, T), SpringDamper([879.0, 552.0], [0.39, 0.52]).compliance(T)
     shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 400, 20), E.feedback(V)

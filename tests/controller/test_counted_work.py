@@ -57,7 +57,7 @@ def test_an_inner_budget_never_exceeds_the_outer_one():
         spend(2.0)
 
 
-def test_only_a_given_clock_ends_work():
+def test_a_clock_ends_work_without_a_budget():
     with pytest.raises(TooLong), within(np.inf, clock=lambda: True):
         spend(0.0)
     spend(0.0)

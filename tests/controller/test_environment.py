@@ -125,7 +125,7 @@ def random_network(rng) -> Network:
     return Network(tuple(contacts), tuple(springs), masses)
 
 
-def test_many_networks_are_each_as_alone():
+def test_stacked_networks_equal_single_ones():
     """Stacked and sampled networks equal single ones, although one of the two has fewer states alone."""
     other = (Spring(("contact 1", "mass"), 90.0, 0.0), Spring(("mass", "contact 2"), 5e3, 7.0))
     networks = [FIGURE_4, Network(FIGURE_4.contacts, other, FIGURE_4.masses)]

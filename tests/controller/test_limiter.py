@@ -1,4 +1,4 @@
-"""The limiter solves a box problem in each tick, with delays and walls, and is passive without lag (rho = 0)."""
+"""The limiter solves a box problem in each tick, with delays and walls, and is passive for rho = 0."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_two_channels_by_hand():
     np.testing.assert_allclose(e[:, 0], [0, -0.014343], rtol=0, atol=1e-9)
 
 
-def test_four_contacts_that_nothing_holds():
+def test_forces_at_contacts_without_ground_are_unique():
     """The stiffness matrix of a chain of springs without ground is singular, but the forces are unique."""
     K = 1000.0 * np.array([[1, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1.0]])
     problem = BoxProblem(K, -np.ones(4), np.array([1.0, 2.0, 3.0, 1.0]))
@@ -93,8 +93,6 @@ def test_four_contacts_that_nothing_holds():
 def test_a_matrix_with_a_negative_minor_is_refused():
     with pytest.raises(SingularLoop, match=r"limited forces \[1, 2\] are not determined"):
         BoxProblem(np.array([[1.0, 2.0], [2.0, 1.0]]), -np.ones(2), np.ones(2))
-    with pytest.raises(ValueError, match="expected lower < upper"):
-        BoxProblem(np.eye(1), np.ones(1), np.ones(1))
 
 
 def test_a_spring_by_hand():
@@ -106,7 +104,7 @@ def test_a_spring_by_hand():
     assert (np.abs(f) <= 1).all()
 
 
-def test_with_lag_a_limited_spring_can_give_energy():
+def test_with_rho_a_limited_spring_can_give_energy():
     """With rho = 0.05 this cycle gives 0.0051 J per turn beyond the damping's dx^2/2; with rho = 0 it gives none."""
     x = np.tile([-1.048, -0.998, 1.028, 1.049, 1.069, 0.996], 20)
     taken = []
@@ -215,8 +213,8 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
             np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-9, atol=1e-9)
 
 
-def test_a_slip_bends_the_tick_computing_the_force():
-    """The tick of a slip is not linear; the limited force acts theta ticks later."""
+def test_a_slip_makes_its_tick_nonlinear():
+    """The state after a tick is nonlinear only if a force slips; the limited force acts theta ticks later."""
     limiter = loop_of(FIGURE_4, (2, 3), (0, 0)).law(STIFF, (3.0, 1.5), (5.0, 2.0))
     buffer = drive(closed(limiter), wander(60, 2, 11))
     slipped = limiter.limited(buffer.z, buffer.f[:60], LIMITS)
@@ -264,7 +262,7 @@ def test_the_first_limited_tick_is_found(channel, sign):
     assert buffer.linear_until(10) == 2
 
 
-def test_limiter_and_environment_are_passive_without_lag():
+def test_limiter_and_environment_are_passive_without_rho():
     """The sum of f_e (x_k - x_{k-1}) is never negative, with walls, limits and V = 0."""
     x = wander(600, 2, 10)
     f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:600]
@@ -288,7 +286,9 @@ def test_clipped_cycles_give_energy_limited_ones_none():
         clipped = np.clip(drive(linear, x).f[: 2 * ticks], -limit, limit)
         assert (clipped[-ticks - 1 : -1] * dx).sum() == pytest.approx(-0.616, abs=0.005)
         f = drive(closed(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling, LIMITS, rho)), x).f[: 2 * ticks]
-        assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # from delay and the network's damping
+        assert (
+            abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated
+        )  # the delay and the network's damping make this rest
         assert (np.abs(f).max(axis=0) <= limit).all()
 
 

@@ -38,7 +38,7 @@ def test_response_is_the_definition(blocks):
 
 
 def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
-    """Eigenvectors and Schur forms are remembered for the last matrices A."""
+    """Eigenvectors and Schur forms of the last matrices A are cached."""
     G, other = blocks
     for H in (G, other, Lti(G.A, 2 * G.B, G.C[::-1], G.D, G.T), Lti(G.A.T, G.C.T, G.B.T, G.D.T, G.T)):
         for z in (Z, 1.5 * Z):  # sums over poles, and substitution
@@ -129,7 +129,7 @@ def test_output_delays_are_powers_of_z(blocks):
         z = 1.1 * Z[:, None, None]
         close(block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D)
         assert block.poles().size == block.order
-    assert loop._lines[0].size == G.order + 5 + 1  # 2 of 3 output delays copy the first
+    assert loop._lines[0].size == G.order + 5 + 1  # of the output's 3 delays, 2 only copy the first
 
 
 def _stiff():
@@ -184,7 +184,7 @@ def test_singular_algebraic_loop_is_refused():
         G.feedback(H)
 
 
-def test_blocks_prove_their_shapes():
+def test_blocks_check_shapes_numbers_and_periods():
     with pytest.raises(ValueError, match=r"C has shape \(1, 3\), expected \(1, 2\)"):
         Lti(np.eye(2), np.ones((2, 1)), np.ones((1, 3)), [[0.0]], 1e-3)
     with pytest.raises(ValueError, match="not finite"):

@@ -54,12 +54,12 @@ def test_an_inerter_is_its_dynamic_stiffness():
     np.testing.assert_allclose(exact.D.astype(float), E.D, rtol=1e-12)
 
 
-def test_springs_without_inertance_are_stored_as_they_were():
+def test_inertance_is_stored_only_if_given():
     assert b"inertance" not in msgspec.json.encode(Spring(("a", "b"), 1.0))
     assert msgspec.json.decode(msgspec.json.encode(INERT), type=Network) == INERT
 
 
-def test_an_element_is_put_among_springs_and_walls():
+def test_elements_become_springs_and_walls():
     made = Network(("a",), (Spring(("a", "ground"), 5.0),), elements=(Hardening(("a", "ground"), 100.0, 2e-3),))
     assert [spring.stiffness for spring in made.springs] == [5.0, 100.0]
     assert [wall.between for wall in made.walls] == [("a", "ground"), ("ground", "a")]

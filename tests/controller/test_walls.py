@@ -62,7 +62,7 @@ def test_walls_return_at_most_their_stored_energy(damping):
 
 @pytest.mark.parametrize("walls", [1, 2, 3, 4])
 def test_the_wall_forces_solve_the_complementarity_problem(walls):
-    """For positive definite, unsymmetric M: p >= 0, s = M p - q >= 0 and p's = 0, to 1e-12 of the terms."""
+    """For positive definite, unsymmetric M: p >= 0, s = M p - q >= 0 and p' s = 0, to 1e-12 of the terms."""
     rng = np.random.default_rng(walls)
     for _ in range(20):
         root, turn = rng.normal(size=(2, walls, walls))
@@ -193,7 +193,7 @@ def boxed(scenario):
         pytest.param("mujoco", 6, 3.0, marks=pytest.mark.validate),
     ],
 )
-def test_any_environment_hands_on_walls_slow_down(name, humans, seconds):
+def test_hands_on_walls_behind_certified_couplings_slow_down(name, humans, seconds):
     """Behind a certified coupling all hands slow down from the first to the last quarter, despite many contacts."""
     scenario = boxed(load())
     assert requirements_of(scenario.loop("I"), SOFT)["any-environment"].certified
@@ -272,9 +272,11 @@ def test_walls_need_more_damping_than_frozen_states():
     assert "no walls" in (requirements_of(late, SOFT)["any-environment"].reason or "")
 
 
-def test_stiffer_couplings_are_certified_for_switching_walls():
-    """With one sample of delay and B = 0.5 any-environment certifies up to 1032 N/m. 1200 N/m is certified for the
-    switching wall, and 1772 N/m with B = 0.453 only in each frozen state."""
+def test_stiffer_couplings_are_certified_for_known_walls():
+    """With B = 0.5 any-environment certifies up to 1032 N/m; this-environment certifies 1200 N/m with the wall.
+
+    1772 N/m with B = 0.453 is certified only while the wall stays open or stays closed.
+    """
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
@@ -320,7 +322,7 @@ def test_at_most_six_walls():
         parse(TEXT.replace("walls = [", "walls = [" + 6 * '{ between = ["tip", "ground"], stiffness = 1.0 }, '))
 
 
-def test_a_command_that_decides_linear_loops_refuses_walls():
+def test_sim_accuracy_refuses_walls():
     with pytest.raises(InputError, match="accepts linear loops only"):
         accuracy(["--scenario", "one-wall"])
 

@@ -1,4 +1,4 @@
-"""Tests of an assessment's guarantee: which loops, couplings and limited forces it covers, and what ends it."""
+"""Tests of an assessment's guarantee: which loops, couplings and forces it covers, and which changes end it."""
 
 import json
 from functools import cache
@@ -81,7 +81,7 @@ def test_an_energy_account_covers_no_latency():
 
 @pytest.mark.slow
 def test_the_limiter_is_judged_with_switching_delays():
-    """The limiter needs 0.70 of the damping with constant delays, and 1.04 if they switch, for a given environment."""
+    """The limiter needs 0.70 of the damping with constant delays, and 1.04 of it if they switch."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
     limits = assess(loop, coupling, environment=loop.environment).force_limits
     assert limits.rho is None
@@ -142,7 +142,7 @@ def test_a_users_condition_must_name_switching_delays():
 
 @pytest.mark.slow
 def test_a_guarantee_names_its_limiters_known_devices():
-    """This-environment requires 0.991 times the available damping, and 1.005 times as much if forces are limited.
+    """This-environment needs 0.991 of the available damping, and 1.005 of it if forces are limited.
 
     So its limiter is not certified, and the limiter of the condition known-device is used and proved.
     """
@@ -347,7 +347,7 @@ def test_commands_agree_on_the_requirement_of_a_wall(tmp_path, monkeypatch, ever
 
 
 @pytest.mark.slow
-def test_switching_before_walls_needs_more_damping():
+def test_switching_delays_need_more_damping_at_walls():
     """A coupling that is certified for a constant delay is not certified for delays of 0 to 2 samples."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert assess(loop, coupling).holds
@@ -367,12 +367,12 @@ def test_guarantees_name_the_environment_that_runs():
 
 SPRING = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
 ALONE = Loop(1.2e-3, (1,), (0,), (0,), (1.37,), SPRING)
-FEW_TRIALS = ("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)  # of a search between vertices
+FEW_TRIALS = ("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)  # a short search between vertices
 
 
 @pytest.mark.slow
 def test_a_search_of_other_ranges_is_repeated(monkeypatch):
-    """Alone a spring k needs 3/2 k T: 0.66 of the damping for 505 N/m (1 % more), 0.92 for 700 N/m (40 % more)."""
+    """A bare spring k needs 3/2 k T: 0.66 of the damping for 505 N/m (1 % more), 0.92 for 700 N/m (40 % more)."""
     for name, few in FEW_TRIALS:
         monkeypatch.setattr(budgets, name, few)
     narrow, wide = (change(ALONE, ranges=ranges_around(SPRING, percent)) for percent in (1.0, 40.0))

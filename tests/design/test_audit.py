@@ -90,8 +90,8 @@ def test_sufficiently_damped_rigid_walls_are_proved_and_stored(theta, proved, tm
     held = assess(loop, coupling).guarantee
     assert (held and held.environments) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
-        made = certificate.prove(loop, coupling, "this-environment")
-        coupling_file.save(coupling_file.Stored.of(loop, coupling, made), tmp_path / "wall.json")
+        proof = certificate.prove(loop, coupling, "this-environment")
+        coupling_file.save(coupling_file.Stored.of(loop, coupling, proof), tmp_path / "wall.json")
         again = coupling_file.load(tmp_path / "wall.json")
         assert again.loop == loop
         assert certificate.verify(again).proved
@@ -163,8 +163,8 @@ def test_the_stiffest_gains_of_late_forces_are_certified(B):
 def test_the_largest_period_is_at_colgates_bound():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
-        found = sensitivity(*subject, condition)
-        assert found.largest_T_s == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
+        edges = sensitivity(*subject, condition)
+        assert edges.largest_T_s == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
 
 
 def test_the_papers_gains_are_not_certified():
@@ -179,7 +179,7 @@ def test_the_papers_gains_are_not_certified():
 
 @pytest.mark.slow
 def test_optimal_gains_rounded_up_fail_any_environment():
-    """Any-environment needs 0.02 % more damping than is available, and this-environment needs about half of it."""
+    """Any-environment needs 0.02 % more than the available damping, and this-environment about half of it."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
     assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
@@ -191,14 +191,14 @@ def test_optimal_gains_rounded_up_fail_any_environment():
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
 def test_certification_ends_at_the_reported_edges(subject, condition):
-    """An edge errs by 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond it."""
+    """An edge errs by at most 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond it."""
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
-    found = sensitivity(loop, coupling, condition)
+    edges = sensitivity(loop, coupling, condition)
     K = np.array(stiffest(loop, coupling, condition).K)
-    least, T = np.array(found.least_delta), found.largest_T_s
-    change, later = msgspec.structs.replace, [n + found.extra_samples for n in loop.theta]
+    least, T = np.array(edges.least_delta), edges.largest_T_s
+    change, later = msgspec.structs.replace, [n + edges.extra_samples for n in loop.theta]
     inside = [
         (loop, SpringDamper(K, coupling.B)),
         (change(loop, T=T), coupling),
@@ -217,10 +217,10 @@ def test_certification_ends_at_the_reported_edges(subject, condition):
 
 def test_figures_that_do_not_exist_have_a_reason():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = sensitivity(*spring, "this-environment")
-    assert (found.largest_T_s, found.extra_samples) == (None, None)
-    assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
-    assert "largest T tried" in found.reason
+    edges = sensitivity(*spring, "this-environment")
+    assert (edges.largest_T_s, edges.extra_samples) == (None, None)
+    assert f"{MOST_EXTRA_SAMPLES} samples more" in edges.reason
+    assert "largest T tried" in edges.reason
     assert "multiple of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
     assert "not certified" in sensitivity(*pair(PUBLISHED["I"]), "this-environment").reason
@@ -488,8 +488,8 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 def test_long_computations_are_refused_or_ended(monkeypatch):
     """A sweep of the pair is estimated at 0.16 ms, and a search at sixty times as much."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
-    told = report(PAIR, SOFT)
-    part, need = told["margins"]["this-environment"], needs(told, "this-environment")
+    outcome = report(PAIR, SOFT)
+    part, need = outcome["margins"]["this-environment"], needs(outcome, "this-environment")
     assert need["certified"]
     assert part["stiffest"]["reason"].startswith("not searched: some 60 sweeps over 8 states and 2 channels would take")
     assert part["sensitivity"]["least_delta"] == need["required_damping"]

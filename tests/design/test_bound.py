@@ -36,14 +36,14 @@ def judged(name):
     calls, charged = [], module._Dual.charged
 
     def recorded(self, x, value, swept):
-        found = charged(self, x, value, swept)
-        calls.append((self, x, value, found[0]))
-        return found
+        limitt = charged(self, x, value, swept)
+        calls.append((self, x, value, limitt[0]))
+        return limitt
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module._Dual, "charged", recorded)
-        found = bound(loop_of(name), knots=16 if name[0] in "no" else None)
-    return found, max(calls, key=lambda call: call[3])
+        limit = bound(loop_of(name), knots=16 if name[0] in "no" else None)
+    return limit, max(calls, key=lambda call: call[3])
 
 
 def transformed(dual, x):
@@ -78,11 +78,11 @@ def transformed(dual, x):
 )
 def test_the_charged_matrix_is_nowhere_negative(name):
     """A Fourier transform of 2^20 points finds D plus the charge nonnegative, to 2 % of the charge."""
-    found, (dual, x, value, charged) = judged(name)
+    limit, (dual, x, value, charged) = judged(name)
     m = dual.loop.channels
     charge = (value - charged) / m
     least = np.linalg.eigvalsh(transformed(dual, x))[:, 0].min()
-    assert found.proved
+    assert limit.proved
     assert charge > 0
     assert least + charge > -0.02 * charge
     assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # at most twice the need, plus 0.3 % of value/m
@@ -91,9 +91,9 @@ def test_the_charged_matrix_is_nowhere_negative(name):
 @pytest.mark.validate
 @pytest.mark.parametrize(("name", "rms_db"), [("I", -35.137), ("II", -13.839)])
 def test_bounds_equal_those_of_separate_code(name, rms_db):
-    found, _ = judged(name)
-    assert found.rms_db == pytest.approx(rms_db, abs=0.006)
-    assert found.sampled_rms > found.rms
+    limit, _ = judged(name)
+    assert limit.rms_db == pytest.approx(rms_db, abs=0.006)
+    assert limit.sampled_rms > limit.rms
 
 
 @pytest.mark.slow
@@ -105,9 +105,9 @@ def test_bounds_equal_those_of_separate_code(name, rms_db):
     ],
 )
 def test_a_charged_bound_is_never_above_the_estimate(name):
-    found, (_, _, value, charged) = judged(name)
+    limit, (_, _, value, charged) = judged(name)
     assert charged <= value
-    assert 0 < found.rms <= found.sampled_rms
+    assert 0 < limit.rms <= limit.sampled_rms
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_the_integral_errs_by_less_than_its_bound(name, high):
     loop = loop_of(name)
     dual = module._Dual.of(loop, (1.0, high), 16)
     x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)
-    found, error = dual.objective_again(x)
+    objective, error = dual.objective_again(x)
     E, H, span = loop.E(), dual.H(x), np.log(min(high, 0.5 / loop.T))
     total, wrong = 0.0, 0.0
     for a, b, left, right in zip(dual.grid[:-1], dual.grid[1:], H[:-1], H[1:], strict=True):
@@ -136,7 +136,7 @@ def test_the_integral_errs_by_less_than_its_bound(name, high):
         fine, coarse = (scipy.integrate.simpson(g[::step], dx=step * (b - a) / 400) for step in (1, 2))
         total, wrong = total + fine, wrong + abs(fine - coarse)
     assert wrong < 1e-7 * abs(total)
-    assert abs(-total - float(dual.cost @ x) - found) <= error + wrong
+    assert abs(-total - float(dual.cost @ x) - objective) <= error + wrong
     assert error < 1e-8 * abs(total)
 
 
@@ -217,11 +217,11 @@ def test_a_full_level_enters_the_dual_value():
 @pytest.mark.parametrize(("latency", "factor"), [(None, 1 / 2), (((5e-4, 8e-4),) * 2, 1 / 1.5)])
 def test_timing_scales_the_level_of_a_bound(monkeypatch, latency, factor):
     """The dual problem's level is Delta T/(T_max - t1), where t1 is the least latency."""
-    seen = []
-    monkeypatch.setattr(module._Dual, "best", lambda dual: (seen.append(dual.loop), 1.0, 1.0)[1:])
+    loops = []
+    monkeypatch.setattr(module._Dual, "best", lambda dual: (loops.append(dual.loop), 1.0, 1.0)[1:])
     bound(msgspec.structs.replace(PLANE, T_max=2 * PLANE.T, latency=latency), knots=8)
-    np.testing.assert_allclose(seen[0].Delta(), factor * np.array(LEVEL), rtol=1e-15)
-    assert seen[0].T_max is None
+    np.testing.assert_allclose(loops[0].Delta(), factor * np.array(LEVEL), rtol=1e-15)
+    assert loops[0].T_max is None
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from haptic_loop.design.lmi import RESERVE, Shaping
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 
 
-def asked(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA) -> Loop:
+def pair(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA) -> Loop:
     return Loop(T, (1, 2), psi, lam, delta, network)
 
 
@@ -31,7 +31,7 @@ HELD = Network(("tip",), (Spring(("tip", "mass"), 800.0, 1.0), Spring(("mass", G
 LONE = Loop(T, (1,), (0,), (1,), (1.37,), HELD)
 
 
-@pytest.fixture(scope="module", params=[LONE, pytest.param(asked(), marks=pytest.mark.validate)], ids=["one", "pair"])
+@pytest.fixture(scope="module", params=[LONE, pytest.param(pair(), marks=pytest.mark.validate)], ids=["one", "pair"])
 def inner(request):
     """Return a loop and its design: one device, and with `make validate` also a pair."""
     return request.param, ccl.design(request.param)
@@ -40,7 +40,7 @@ def inner(request):
 @pytest.mark.parametrize(("order", "diagonal"), [(1, True), (2, True), (1, False), (2, False)])
 def test_every_family_contains_the_spring_damper(order, diagonal):
     gains = SpringDamper([500.0, 900.0], [0.4, 1.0])
-    loop = asked(delta=(2.0, 0.8))
+    loop = pair(delta=(2.0, 0.8))
     family = _FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(gains)
     assert p.shape == (family.unknowns,)
@@ -50,7 +50,7 @@ def test_every_family_contains_the_spring_damper(order, diagonal):
 @pytest.mark.parametrize(("order", "diagonal"), [(1, True), (2, False)])
 @pytest.mark.parametrize("case", [(1, 2), (0, 0)])
 def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case):
-    loop = asked(case, delta=(2.0, 0.8))
+    loop = pair(case, delta=(2.0, 0.8))
     family = _FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(SpringDamper([500.0, 900.0], [0.4, 1.0]))
     p = p + 0.05 * np.random.default_rng(0).normal(size=p.size)
@@ -67,7 +67,7 @@ def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case
 
 @pytest.mark.parametrize("diagonal", [True, False])
 def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
-    family = _FixedOrder(Shaping(asked((0, 0))), np.array([0.4, 0.3]), 2, diagonal)
+    family = _FixedOrder(Shaping(pair((0, 0))), np.array([0.4, 0.3]), 2, diagonal)
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, family.unknowns))
 
@@ -82,29 +82,29 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
 @pytest.mark.slow
 def test_fixed_order_designs_beat_spring_dampers(inner):
     """The norms were 4.30 for one device and below 9.8 for the pair; spring-dampers have 5.58 and 11.25."""
-    loop, found = inner
-    assert found.objective <= (4.31 if loop is LONE else 9.8)
-    assert found.objective < spring_damper.design(loop).objective
+    loop, design = inner
+    assert design.objective <= (4.31 if loop is LONE else 9.8)
+    assert design.objective < spring_damper.design(loop).objective
 
 
 @pytest.mark.slow
 def test_results_are_certified_from_the_coupling_alone(inner):
-    loop, found = inner
-    V = found.coupling.V
+    loop, design = inner
+    V = design.coupling.V
     assert V.order == loop.channels
     assert any_environment(V, loop.theta, loop.delta).ratio <= 1 - RESERVE + 1e-6
-    assert Shaping(loop).norm(V)[0] == pytest.approx(found.objective, rel=1e-9)
-    F = force_map(loop.E(), found.coupling, loop.theta, loop.psi)
+    assert Shaping(loop).norm(V)[0] == pytest.approx(design.objective, rel=1e-9)
+    F = force_map(loop.E(), design.coupling, loop.theta, loop.psi)
     assert F.is_stable()
     assert this_environment(F, loop.delta).certified
 
 
 @pytest.mark.slow
 def test_every_descent_step_is_feasible_and_better():
-    loop = asked((0, 0))
+    loop = pair((0, 0))
     family = _FixedOrder(Shaping(loop))
     # The descent starts strictly inside the condition: these gains leave 0.01 N s/m unused.
-    gains = spring_damper.design(asked((0, 0), delta=(1.36, 1.36))).coupling
+    gains = spring_damper.design(pair((0, 0), delta=(1.36, 1.36))).coupling
     p = family.start(gains)
     norm = Shaping(loop).norm(gains.compliance(T))[0]
     for _, step in zip(range(3), _descend(family, p, norm), strict=False):
@@ -120,9 +120,9 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     """For the design's poles condition and norm are convex at each frequency: the design is the optimum of cvxpy."""
     import cvxpy as cp  # at the top it would take every worker that collects this file more than a second
 
-    loop, found = inner
-    shaping, poles = Shaping(loop), np.diag(found.coupling.V.A)
-    highest = shaping.norm(found.coupling.V)[1]
+    loop, design = inner
+    shaping, poles = Shaping(loop), np.diag(design.coupling.V.A)
+    highest = shaping.norm(design.coupling.V)[1]
     w = np.unique([*np.geomspace(1e-2, np.pi, 40), *highest * np.linspace(0.9, 1.1, 21)])
     z = np.exp(1j * w)
     x, t = cp.Variable(2 * poles.size), cp.Variable()  # V_i = x_2i + x_(2i+1) (1 - z)/(z - pole_i) [mm/N]
@@ -137,7 +137,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
             terms.append(1e-3 * part[:, None, None] * left[:, :, i : i + 1] @ right[:, i : i + 1])
 
     def real(M):
-        return np.block([[M.real, -M.imag], [M.imag, M.real]]) / found.objective
+        return np.block([[M.real, -M.imag], [M.imag, M.real]]) / design.objective
 
     felt = [
         real(fixed) + sum(x[n] * real(terms[n][k]) for n in range(len(terms))) for k, fixed in enumerate(late @ right)
@@ -149,7 +149,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("loop", "order", "diagonal"),
-    [pytest.param(asked(), 1, False, marks=pytest.mark.validate), (LONE, 3, True)],
+    [pytest.param(pair(), 1, False, marks=pytest.mark.validate), (LONE, 3, True)],
     ids=["pair", "one"],
 )
 def test_three_steps_beat_the_structured_design(loop, order, diagonal):
@@ -166,12 +166,12 @@ def test_environment_delay_designs_never_worsen_their_start():
         ("tip",), (Spring(("tip", "mass"), 200.0, 0.25), Spring(("mass", GROUND), 25.0, 0.25)), {"mass": 0.5}
     )
     loop = Loop(T, (1,), (1,), (0,), (1.37,), soft)
-    found = ccl.design(loop, most_sdps=3)
-    assert found.requirement.certified
-    assert found.phi is not None
+    design = ccl.design(loop, most_sdps=3)
+    assert design.requirement.certified
+    assert design.phi is not None
     # The design is never worse than its starting gains, which leave `_START_ROOM` of the damping unused.
     room = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
-    assert found.objective <= spring_damper.design(room).objective * (1 + 1e-9)
+    assert design.objective <= spring_damper.design(room).objective * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_environment_delay_designs_never_worsen_their_start():
 )
 def test_an_order_of_zero_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        ccl.design(asked(), **options)
+        ccl.design(pair(), **options)
 
 
 def test_a_free_mass_is_called_useless(tmp_path, capsys):

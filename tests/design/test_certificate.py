@@ -50,17 +50,17 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
 def test_loops_with_psi_are_proved_with_phi(psi):
     """With psi = 1 in a channel, Theorem 4 needs a large enough Phi and guarantees this environment only."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
-    found = spring_damper.design(loop)
-    stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "any-environment", found.phi))
+    design = spring_damper.design(loop)
+    stored = Stored.of(loop, design.coupling, prove(loop, design.coupling, "any-environment", design.phi))
     assert stored.certificate.guarantee == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E"}
     assert verify(stored) == Verdict(True)
-    least = prove(loop, found.coupling, "any-environment")  # `prove` finds the least Phi
-    assert verify(Stored.of(loop, found.coupling, least)) == Verdict(True)
+    least = prove(loop, design.coupling, "any-environment")  # `prove` finds the least Phi
+    assert verify(Stored.of(loop, design.coupling, least)) == Verdict(True)
     with pytest.raises(NotProved, match="needs a multiplier Phi, one entry per channel"):
-        prove(loop, found.coupling, "any-environment", [0.1])
+        prove(loop, design.coupling, "any-environment", [0.1])
     with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
-        prove(loop, found.coupling, "any-environment", 0.9 * found.phi)
+        prove(loop, design.coupling, "any-environment", 0.9 * design.phi)
     forged = sealed(change(stored.certificate, multipliers={"Phi": (0.01, 0.01)}))
     assert not verify(change(stored, certificate=forged)).proved
 
@@ -266,12 +266,12 @@ def test_a_bad_file_gets_one_error_line(tmp_path, old, new, names):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
+    ("content", "message"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
 )
-def test_files_without_a_coupling_are_refused(tmp_path, content, said):
+def test_files_without_a_coupling_are_refused(tmp_path, content, message):
     path = tmp_path / "coupling.json"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=f"coupling.json: .*{said}"):
+    with pytest.raises(InputError, match=f"coupling.json: .*{message}"):
         load(path)
 
 
@@ -305,9 +305,9 @@ def test_realisations_changed_by_rounding_are_refused(condition):
     assert verify(certified(loop, cancelling(1.0), condition)).proved
     with pytest.raises(NotProved, match=r"rounding may change the forces by 1\.\de-04 \(relative\)"):
         prove(loop, cancelling(1000.0), condition)
-    asked, good = required_damping(loop, cancelling(1000.0), condition), prove(loop, cancelling(1.0), condition)
+    requirement, good = required_damping(loop, cancelling(1000.0), condition), prove(loop, cancelling(1.0), condition)
     scenario = digest(loop, cancelling(1000.0).form())
-    claims = change(good, scenario=scenario, required=asked.required, margin=1 / asked.ratio)
+    claims = change(good, scenario=scenario, required=requirement.required, margin=1 / requirement.ratio)
     reason = verify(Stored.of(loop, cancelling(1000.0), sealed(claims))).reason
     assert reason.startswith("rounding may change the forces by ")
 
@@ -371,16 +371,16 @@ def test_a_sweep_above_the_damping_refuses_proofs(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("loop", "coupling", "said"),
+    ("loop", "coupling", "message"),
     [
         (change(DEFAULT, theta=(400, 400), psi=(1, 0)), STIFF, "801 states.* 800 "),
         (DEFAULT, SpringDamper((7806.0, 3137.0), (1e-300, 1.0)), "1e-300 has too many digits for exact arithmetic"),
     ],
 )
-def test_limits_are_checked_before_anything_is_built(monkeypatch, loop, coupling, said):
+def test_limits_are_checked_before_anything_is_built(monkeypatch, loop, coupling, message):
     monkeypatch.setattr(Loop, "sent", lambda *_: pytest.fail("built"))
     for condition in ("this-environment", "any-environment"):
-        with pytest.raises(NotProved, match=said):
+        with pytest.raises(NotProved, match=message):
             prove(loop, coupling, condition)
 
 
@@ -397,7 +397,7 @@ def test_proofs_with_too_many_digits_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["T", "K", "version", "proof"])
-def test_a_name_that_stands_twice_is_refused(tmp_path, name):
+def test_repeated_names_in_files_are_refused(tmp_path, name):
     path = tmp_path / "coupling.json"
     save(of_stiff_gains(), path)
     lines = path.read_text().splitlines(keepends=True)
@@ -424,10 +424,10 @@ def test_irregular_or_huge_files_are_refused(tmp_path):
 
 
 def test_any_environment_ignores_the_realisation_and_walls():
-    own = ANY_ENVIRONMENT.required(PAIR, SOFT)
-    whole = ANY_ENVIRONMENT.required(PAIR, Compliance(SOFT.compliance(PAIR.T)))
-    assert max(own.required) == pytest.approx(max(whole.required), rel=1e-6)
-    assert own.certified
+    structured = ANY_ENVIRONMENT.required(PAIR, SOFT)
+    general = ANY_ENVIRONMENT.required(PAIR, Compliance(SOFT.compliance(PAIR.T)))
+    assert max(structured.required) == pytest.approx(max(general.required), rel=1e-6)
+    assert structured.certified
     walled = change(FIGURE_4, walls=(Wall(("contact 1", "ground"), 3000.0),))
     behind = required_damping(PAIR.at(walled), SOFT, "any-environment")
     assert behind.condition == "any-environment"
@@ -466,18 +466,18 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
         needed = required_damping(loop, coupling, "this-environment").required
         # A proof may need 1e-4 more damping than the sweep.
         for factor, expected in ((1 + 1e-4, True), (1 - 1e-6, False)):
-            asked = change(loop, delta=tuple(d * factor for d in needed))
+            damped = change(loop, delta=tuple(d * factor for d in needed))
             try:
-                assert verify(certified(asked, coupling, "this-environment")).proved == expected
+                assert verify(certified(damped, coupling, "this-environment")).proved == expected
             except NotProved:
                 assert not expected
 
 
 def test_proof_and_sweep_agree_on_random_networks():
     """Of 12 random networks 4 to 8 are proved, and the sweep agrees on each of the 12."""
-    found = list(proofs(11, 12))
-    assert [row for row in found if not row.holds] == []
-    assert 3 < sum(row.proved for row in found) < 9
+    rows = list(proofs(11, 12))
+    assert [row for row in rows if not row.holds] == []
+    assert 3 < sum(row.proved for row in rows) < 9
 
 
 def test_every_block_has_a_limit_of_states(monkeypatch):
@@ -512,8 +512,8 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
 def test_a_loop_with_a_long_delay_is_stored(tmp_path):
     """A delay of 101 samples, one more than an audit allows, is proved with 110 states, saved, loaded and verified."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
-    kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
-    save(kept, tmp_path / "late.json")
+    stored = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
+    save(stored, tmp_path / "late.json")
     again = load(tmp_path / "late.json")
     assert again.loop.theta == (1, 101)
     assert len(again.certificate.matrices["P"]) > 100

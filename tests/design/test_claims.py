@@ -43,7 +43,7 @@ def window(theta):
     return sum(Z**-j for j in range(theta + 1))
 
 
-def line(K, B, theta):
+def theorem_4(K, B, theta):
     """Return the damping that Theorem 4 needs at each w: (1 - cos (theta+1) w) / (2 Re V (z-1)/(T z))."""
     passivity = (K * T / 2 + B) / np.abs(K / RATE + B) ** 2  # Re V (z-1)/(T z)
     return np.sin((theta + 1) * W / 2) ** 2 / passivity
@@ -97,8 +97,8 @@ def test_devices_and_hands_keep_the_sampled_energy_balance():
         stored = (v**2 @ masses) / 2 + (14500 * (q[:, :2] - q[:, 2:]) ** 2 + 200 * q[:, 2:] ** 2).sum(axis=1) / 2
         dq = np.diff(q, axis=0)
         f, dx, dh = record.f[:-1], dq[:, :2], dq[:, 2:]
-        given = np.cumsum((-f * dx + w[:-1] * dh - DELTA / T * dx**2).sum(axis=1))
-        assert (stored[1:] <= stored[0] + given + 1e-12).all()
+        supply = np.cumsum((-f * dx + w[:-1] * dh - DELTA / T * dx**2).sum(axis=1))
+        assert (stored[1:] <= stored[0] + supply + 1e-12).all()
         if not pushing:
             assert (np.cumsum((-f * dx).sum(axis=1)) >= np.cumsum((DELTA / T * dx**2).sum(axis=1)) - stored[0]).all()
 
@@ -169,13 +169,13 @@ def test_figure_6_is_quiet_with_the_printed_gains():
 
 @pytest.mark.parametrize(("coupling", "expected"), [(PUBLISHED["I"], (7.63, 7.84)), (PUBLISHED["II"], (7.04, 3.89))])
 def test_the_printed_gains_fail_the_papers_condition(coupling, expected):
-    found = [line(K, B, n).max() for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True)]
-    assert found == pytest.approx(expected, abs=0.005)
-    assert min(found) > 2.8 * DELTA
+    needs = [theorem_4(K, B, n).max() for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True)]
+    assert needs == pytest.approx(expected, abs=0.005)
+    assert min(needs) > 2.8 * DELTA
     # The equivalent |K T window + B (1 - z^-n)|^2 <= 4 delta (K T/2 + B) gives the same figures.
     for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True):
         size = np.abs(K * T * window(n) + B * (1 - Z ** -(n + 1))) ** 2
-        assert (size / (4 * (K * T / 2 + B))).max() == pytest.approx(line(K, B, n).max(), rel=1e-6)
+        assert (size / (4 * (K * T / 2 + B))).max() == pytest.approx(theorem_4(K, B, n).max(), rel=1e-6)
 
 
 def figure_4_at(z):
@@ -238,11 +238,11 @@ def test_a_rigid_wall_is_not_the_worst_environment():
     masses = [needed(1 / (M * RATE), K, B, theta) for M in np.geomspace(0.01, 1, 200)]
     assert max(masses) == pytest.approx(1.3769, abs=5e-5)
     assert np.geomspace(0.01, 1, 200)[np.argmax(masses)] == pytest.approx(0.0357, rel=0.03)  # masses are 2.3 % apart
-    assert line(K, B, theta).max() == pytest.approx(1.5160, abs=5e-5)
+    assert theorem_4(K, B, theta).max() == pytest.approx(1.5160, abs=5e-5)
     # this-environment gives the same for the mass. Before the wall a coupling without a damper needs (theta + 1/2) K T.
     E = environment(Network(("a",), masses={"a": 0.0357}), T)
-    found = this_environment(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
-    assert found == pytest.approx(1.3769, abs=5e-5)
+    required = this_environment(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
+    assert required == pytest.approx(1.3769, abs=5e-5)
     assert needed(0 * RATE, K, 0.0, theta) == pytest.approx((theta + 0.5) * K * T, rel=1e-6)
 
 
@@ -251,7 +251,7 @@ def test_a_lossless_environment_attains_theorem_4(seed):
     """A lossless environment q = 1/E-hat attains the damping of Theorem 4 at one frequency and exceeds it at none."""
     rng = np.random.default_rng(seed)
     K, B, theta = np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2)), int(rng.integers(0, 4))
-    asked = line(K, B, theta)
+    required = theorem_4(K, B, theta)
     k = int(rng.integers(W.size // 10, 9 * W.size // 10))
     inner, angle = 1 / (K / RATE[k] + B), (theta + 1) * W[k]
     reactance = inner.real / np.tan(angle / 2) - inner.imag
@@ -259,10 +259,10 @@ def test_a_lossless_environment_attains_theorem_4(seed):
     tangent = (Z - 1) / (Z + 1)
     q = reactance * tangent / tangent[k].imag if reactance > 0 else -reactance * tangent[k].imag / tangent
     assert q[k] == pytest.approx(1j * reactance, rel=1e-6)
-    there = -(Z ** -(theta + 1) / (q + 1 / (K / RATE + B))).real
-    assert there[k] == pytest.approx(asked[k], rel=1e-6)
+    attained = -(Z ** -(theta + 1) / (q + 1 / (K / RATE + B))).real
+    assert attained[k] == pytest.approx(required[k], rel=1e-6)
     middle = (W > 1e-2) & (W < 3.1)  # (z-1)/(z+1) loses digits at both ends
-    assert (there <= asked * (1 + 1e-6) + 1e-9)[middle].all()
+    assert (attained <= required * (1 + 1e-6) + 1e-9)[middle].all()
 
 
 @pytest.mark.parametrize("theta", range(5))
@@ -418,21 +418,21 @@ def test_clipping_lets_a_certified_loop_swing_forever():
 def test_the_multiplier_block_has_a_schur_complement():
     """The matrix of (14) is positive if and only if Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1."""
     rng = np.random.default_rng(7)
-    seen = set()
+    outcomes = set()
     for _ in range(300):
         D = np.diag(rng.uniform(0.5, 2, 2))
         root = rng.normal(size=(2, 2)) * 0.6
         Phi = root @ root.T + 1e-3 * np.eye(2)
         extra = rng.normal(size=(2, 2)) * 0.3
         Delta_V = Phi + (extra + extra.T) / 2 + rng.uniform(0, 2) * np.eye(2)
-        whole = np.linalg.eigvalsh(np.block([[D - Phi, -Phi], [-Phi, Delta_V - Phi]])).min() > 0
+        positive = np.linalg.eigvalsh(np.block([[D - Phi, -Phi], [-Phi, Delta_V - Phi]])).min() > 0
         covered = np.linalg.eigvalsh(D - Phi).min() > 0
         if covered:
             price = np.linalg.inv(np.linalg.inv(Phi) - np.linalg.inv(D))
             covered = np.linalg.eigvalsh(Delta_V - price).min() > 0
-        assert whole == covered
-        seen.add(whole)
-    assert seen == {True, False}
+        assert positive == covered
+        outcomes.add(positive)
+    assert outcomes == {True, False}
 
 
 def test_one_sample_of_psi_exceeds_the_damping():
@@ -490,14 +490,14 @@ def test_active_environments_get_no_any_environment_guarantee():
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):
         loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), Resonant(size, angle))
-        found = assess(loop, coupling)
-        needs = found.requirements["any-environment"]
+        assessment = assess(loop, coupling)
+        needs = assessment.requirements["any-environment"]
         if passive:
             assert needs.certified
         else:
             assert not needs.certified
             assert "Resonant: not passive" in needs.reason
-            assert found.guarantee is None or not found.guarantee.any_environment
+            assert assessment.guarantee is None or not assessment.guarantee.any_environment
 
 
 def test_a_multiplier_covers_narrow_resonances():
@@ -518,7 +518,7 @@ def test_a_guarantee_over_ranges_names_its_vertices():
     """Between the vertices a search supports the guarantee, not a proof."""
     scenario = load("omega-pair-ranges")
     delays = scenario.loop("I").delays
-    given = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3)
-    assert "proved at every vertex, searched between them" in given.words
-    half = replace(given, vertices="128 of 256 vertices").words
+    guarantee = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3)
+    assert "proved at every vertex, searched between them" in guarantee.words
+    half = replace(guarantee, vertices="128 of 256 vertices").words
     assert half == "these ranges: proved at 128 of 256 vertices, searched between them"

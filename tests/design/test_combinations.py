@@ -57,7 +57,7 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_damping_within_bounds(k, damping, theta, latency, most):
-    """The requirement is at least 4 % below `most`, computed for m = 0 and a separate bound on each part of a period.
+    """The requirement is at least 4 % below `most`, which holds for m = 0 and separate bounds on parts of a period.
 
     A wall that never loses contact needs no more.
     """
@@ -89,8 +89,8 @@ def test_limiter_and_walls_need_damping_within_bounds(theta, known, alone):
 def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
     """rho is 13 N/m and the latency 0.3 ms; `known` was computed for the walls' m = 0, which costs at most 2.4e-4."""
     loop = loop_of(held(*(wall(3000.0, 2.0) for _ in walls)), 1e-3, theta, latency=((0.3e-3, 0.3e-3),))
-    found = need(loop, COUPLING, 13.0)
-    assert known * (1 - 5e-4) < found < known * (1 + 5e-5)
+    required = need(loop, COUPLING, 13.0)
+    assert known * (1 - 5e-4) < required < known * (1 + 5e-5)
 
 
 EVERY = {  # fields of a loop by the fact that they add; `walls` and `rho` are read by `combined`
@@ -257,10 +257,10 @@ def test_walls_with_ranges_are_guaranteed_for_ranges():
     """Every vertex is proved, and the search between the vertices uses the multipliers of the proof."""
     network = held(wall(3000.0, 2.0))
     loop = loop_of(network, 1e-3, 1, 1.3, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
-    found = assess(loop, COUPLING, ranges_samples=2)
-    assert found.ranges.proved
-    assert found.holds
-    assert found.guarantee.environments == "these ranges"
+    assessment = assess(loop, COUPLING, ranges_samples=2)
+    assert assessment.ranges.proved
+    assert assessment.holds
+    assert assessment.guarantee.environments == "these ranges"
     assert not assess(change(loop, delta=(1.2,)), COUPLING, ranges_samples=0).holds
 
 
@@ -288,8 +288,8 @@ def anywhere(further, delta=10.0, coupling=ANYWHERE, **network):
 )
 def test_springs_before_any_environment_need_the_closed_form(further, theta, needs):
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1000.0),)), theta=theta, **further)
-    found = required_damping(loop, SpringDamper([1000.0], [0.0]), ANY_ENVIRONMENT)
-    assert found.required[0] == pytest.approx(needs, rel=1e-7)
+    requirement = required_damping(loop, SpringDamper([1000.0], [0.0]), ANY_ENVIRONMENT)
+    assert requirement.required[0] == pytest.approx(needs, rel=1e-7)
 
 
 def test_any_environment_with_latency_meets_its_formula():
@@ -314,9 +314,9 @@ def test_periods_latency_and_switching_meet_their_formula():
     T, longest, tau, lo, hi = 1e-3, 1.4e-3, 0.3e-3, 0, 2
     further = {"varying_delay": DelayRange((lo,), (hi,)), "latency": ((tau, tau),), "T_max": longest}
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1.0),)), T, 1, **further)
-    found = required_damping(loop, SpringDamper([900.0], [0.3]), ANY_ENVIRONMENT)
-    (delta,), (alpha,) = found.required, found.multiplier
-    z = np.exp(1j * np.append(np.linspace(1e-4, np.pi, 20001), 2 * np.pi * T * found.frequency_hz))
+    requirement = required_damping(loop, SpringDamper([900.0], [0.3]), ANY_ENVIRONMENT)
+    (delta,), (alpha,) = requirement.required, requirement.multiplier
+    z = np.exp(1j * np.append(np.linspace(1e-4, np.pi, 20001), 2 * np.pi * T * requirement.frequency_hz))
     V = 1 / (900.0 + 0.3 * (1 - 1 / z) / T)
     d = np.stack([z, np.ones_like(z)], axis=1)
     c = np.stack([sum(sum(z**-k for k in range(n + j)) for n in (lo, hi)) / 2 for j in (2, 1)], axis=1)
@@ -386,10 +386,10 @@ def test_below_the_requirement_some_hands_gain_energy(further):
 def test_the_stiffest_coupling_attains_the_latency_limit(theta, tau):
     """V(1) = ((theta + 1) T + tau)/(2 delta) is the least compliance of a linear coupling."""
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1e3),)), theta=theta, latency=((tau, tau),))
-    found = design_coupling(loop, "moving-average", "any-environment")
+    design = design_coupling(loop, "moving-average", "any-environment")
     limit = 2 / ((theta + 1) * 1.2e-3 + tau)
-    assert 0.999 * limit < 1 / found.coupling.compliance(1.2e-3).dc()[0, 0] < limit
-    assert prove(loop, found.coupling, "any-environment").proof == "rational"
+    assert 0.999 * limit < 1 / design.coupling.compliance(1.2e-3).dc()[0, 0] < limit
+    assert prove(loop, design.coupling, "any-environment").proof == "rational"
 
 
 # The block of each hands' side with any facts is the quadratic form of docs/theory.md, in phasors at one frequency.

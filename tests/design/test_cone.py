@@ -65,9 +65,9 @@ def test_a_known_optimum_is_found(seed, settings):
     """Complementary S(x) and Z, with Z in the dual's set, prove x optimal; cvxpy finds the same value."""
     rng = np.random.default_rng(seed)
     problem, x = with_known_optimum(rng, 7, [(3, 4, True), (1, 5, False), (4, 1, False), (2, 2, True)])
-    found = problem.solve("it", settings=settings)
-    assert problem.cost @ found == pytest.approx(problem.cost @ x, rel=1e-6, abs=1e-6)
-    assert problem.violation(found) < 1e-7
+    optimum = problem.solve("it", settings=settings)
+    assert problem.cost @ optimum == pytest.approx(problem.cost @ x, rel=1e-6, abs=1e-6)
+    assert problem.violation(optimum) < 1e-7
     v = cp.Variable(7)
     constraints = []
     for block in problem.blocks:
@@ -75,7 +75,7 @@ def test_a_known_optimum_is_found(seed, settings):
             matrix = constant + sum(v[a] * slope[k] for a, slope in zip(block.unknowns, block.slopes, strict=True))
             constraints.append((matrix if len(constant) == 1 else (matrix + matrix.H) / 2) >> 0)
     other = solve(cp.Problem(cp.Minimize(problem.cost @ v), constraints))
-    assert problem.cost @ found == pytest.approx(other, rel=1e-5, abs=1e-5)
+    assert problem.cost @ optimum == pytest.approx(other, rel=1e-5, abs=1e-5)
 
 
 def test_a_large_block_is_solved_without_clarabel(monkeypatch):

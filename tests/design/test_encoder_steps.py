@@ -80,8 +80,8 @@ def test_axes_share_the_friction_of_their_device():
     devices = [change(device, friction=0.3, encoder_step=STEP) for device in space.device]
     coupling = SpringDamper([400.0] * 6, [0.1] * 6)
     assessment = SimpleNamespace(guarantee=None, coupling=coupling, environment=space.environment)
-    found = encoder_steps(space.replace(device=devices), "I", assessment)
-    assert found.friction == pytest.approx([0.3 / 3**0.5] * 6)
+    steps = encoder_steps(space.replace(device=devices), "I", assessment)
+    assert steps.friction == pytest.approx([0.3 / 3**0.5] * 6)
 
 
 def test_friction_covers_no_steps_of_known_devices():
@@ -173,7 +173,7 @@ def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, m
     monkeypatch.chdir(tmp_path)
     code, line, record = _first_line(command, scenario, options, tmp_path, capsys)
     if command is compare_command:
-        said = {
+        expected = {
             "lost": "spring-damper (none)",
             "steps": "for exact positions only",
             "friction": "encoder steps with this object only",
@@ -181,13 +181,13 @@ def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, m
         (coupling,) = record["couplings"]
         assessment = coupling["assessment"]
     else:
-        said = {
+        expected = {
             "lost": "Not certified: a lost packet makes a force older than the range of delays.",
             "steps": "Not covered: the encoder steps of the devices.",
             "friction": "Encoder steps are covered with this object only, while forces stay below their limits.",
         }
         assessment = record["assessment"]
-    assert said[scenario] in line
+    assert expected[scenario] in line
     assert (assessment["guarantee"] is None) == (scenario == "lost")
     if scenario != "lost":
         assert assessment["encoder"]["covered"] == (scenario == "friction")
@@ -270,8 +270,8 @@ def test_quantised_loops_gain_no_energy(amplitude):
     k = np.arange(4000)[:, None, None]
     way = np.minimum(k / 200, 1)  # ramp from rest to the position where the encoder's value changes
     x = STEP * way * (0.5 + amplitude * np.sin(2 * np.pi * hz * T * k + phase))  # (ticks, channels, motions)
-    seen, state, plain, paid, least = np.round(x / STEP) * STEP, np.zeros((F.order, 25)), 0.0, 0.0, np.inf
-    for measured, dx in zip(seen, np.diff(x, axis=0), strict=False):
+    rounded, state, plain, paid, least = np.round(x / STEP) * STEP, np.zeros((F.order, 25)), 0.0, 0.0, np.inf
+    for measured, dx in zip(rounded, np.diff(x, axis=0), strict=False):
         work = ((F.C @ state + F.D @ measured) * dx).sum(axis=0) + delta / T @ dx**2
         state = F.A @ state + F.B @ measured
         plain, paid = plain + work, paid + work + W @ np.abs(dx)

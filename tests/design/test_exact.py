@@ -59,7 +59,7 @@ def test_a_float_counts_as_its_shortest_decimal():
 
 def test_definiteness_agrees_with_eigenvalues():
     rng = np.random.default_rng(1)
-    seen = set()
+    outcomes = set()
     for _ in range(300):
         S = symmetric_integers(rng, int(rng.integers(1, 7)))
         idle = rng.integers(0, 5, len(S)) == 0
@@ -70,12 +70,12 @@ def test_definiteness_agrees_with_eigenvalues():
             assert outcome.definite == (least > 0)
             assert _strictly_positive(Matrix.of(S.tolist())) == (least > 0)
         assert outcome.semidefinite == (least > -1e-9)
-        seen.add(outcome.definite)
+        outcomes.add(outcome.definite)
         assert bool(outcome.rows) != outcome.definite
         if outcome.rows:
             minor = S[np.ix_(*[np.array(outcome.rows) - 1] * 2)]
             assert np.sign(round(np.linalg.det(minor))) == (0 if outcome.semidefinite else -1)
-    assert seen == {True, False}
+    assert outcomes == {True, False}
 
 
 @pytest.mark.parametrize(
@@ -219,8 +219,8 @@ def test_a_wrong_storage_matrix_proves_nothing():
     assert "negative direction" in _prove_positive_real(G, Matrix.of([[5]]))
     # with P = 1 the matrix is diag(3/4, 2 D - 1): floating point cannot tell its entry of 2e-30 from zero
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
-        told = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
-        assert told is reason or told.startswith(reason)
+        refusal = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
+        assert refusal is reason or refusal.startswith(reason)
     zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # with P = 1 the KYP matrix is exactly zero
     assert _prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
     # An unstable block may have a positive KYP matrix with P < 0; only the inequality P > 0 refuses it.
@@ -280,10 +280,10 @@ def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
         P = Matrix.of(back @ (half @ half.T) @ back / 7)
         row, column = exact._halves(P), exact._halves(Matrix.of(G.D + G.D.T))
         size = np.diag([Fraction(2) ** h for h in row])
-        taken = size @ exact._rounded(P, row, bits) @ size * Fraction(1, 2**bits)
-        found, most = exact._kyp_matrix(G, P, bits, finer)
+        rounded = size @ exact._rounded(P, row, bits) @ size * Fraction(1, 2**bits)
+        integers, most = exact._kyp_matrix(G, P, bits, finer)
         size = np.diag([Fraction(2) ** -h for h in [*row, *column]])
-        error = 2**finer * (size @ kyp(G, taken) @ size) - found
+        error = 2**finer * (size @ kyp(G, rounded) @ size) - integers
         worst = np.abs(np.linalg.eigvalsh(error.astype(float))).max() / most
         assert worst <= 1
         fullest = max(fullest, worst)
@@ -298,8 +298,8 @@ def test_the_exact_test_refuses_alone(monkeypatch):
     low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
     for p, expected in ((low, (False, True)), (high, (True, False))):
         for factor, proved in zip((1 - 1e-9, 1 + 1e-9), expected, strict=True):
-            found = _prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
-            assert (found is None) == proved
+            refusal = _prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
+            assert (refusal is None) == proved
 
 
 def test_floating_point_refuses_no_definite_matrix():

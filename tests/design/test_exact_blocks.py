@@ -57,8 +57,8 @@ def highest(value: Callable[[np.ndarray], np.ndarray]) -> float:
     best = float(values.max())
     for i in np.argsort(values)[-3:]:
         low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
-        found = minimize_scalar(lambda w: -value(np.array([w]))[0], bounds=(low, high), options={"xatol": 1e-11})
-        best = max(best, -found.fun)
+        peak = minimize_scalar(lambda w: -value(np.array([w]))[0], bounds=(low, high), options={"xatol": 1e-11})
+        best = max(best, -peak.fun)
     return best
 
 
@@ -88,7 +88,7 @@ def sent(z, coupling, psi=(0, 0)):
     return np.linalg.solve(np.eye(2) + X @ V, X)
 
 
-def loop(network: Network, theta, psi=None, delta=None, period=T) -> Loop:
+def loop_of(network: Network, theta, psi=None, delta=None, period=T) -> Loop:
     m = len(theta)
     return Loop(period, theta, psi or (0,) * m, theta, delta or (1.0,) * m, network)
 
@@ -114,13 +114,13 @@ def test_the_exact_block_holds_the_damping_exactly():
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_springs_need_the_closed_form(theta):
     """The limit is (theta + 1/2) K T."""
-    F = loop(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    F = loop_of(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
 
 
 def test_undelayed_spring_dampers_need_the_closed_form():
     """The limit is K T/2 + B."""
-    F = loop(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    F = loop_of(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
 
 
@@ -128,7 +128,7 @@ def test_joined_channels_need_the_largest_eigenvalue():
     """The limit is (theta + 1/2) T times the largest eigenvalue of K relative to the dampings."""
     K, ratio = np.array([[900.0, -300.0], [-300.0, 400.0]]), np.array([1.0, 0.37])
     springs = (Spring(("a", "b"), 300.0), Spring(("a", "ground"), 600.0), Spring(("b", "ground"), 100.0))
-    F = loop(Network(("a", "b"), springs), (2, 2)).F(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
+    F = loop_of(Network(("a", "b"), springs), (2, 2)).F(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
     top = np.linalg.eigvalsh(K / np.sqrt(ratio[:, None] * ratio)).max()
     assert_limit(lambda d: both(this_environment_demand(F, [d, 0.37 * d])), 2.5 * T * top)
 
@@ -140,7 +140,7 @@ def test_figure_4_needs_what_a_sweep_finds(theta, psi):
         F = late(z, theta) @ sent(z, STIFF, psi)
         return np.linalg.eigvalsh(-T * he(F / (z - 1)[:, None, None])).max(axis=1)
 
-    F = loop(FIGURE_4, theta, psi).F(STIFF, exact=True)
+    F = loop_of(FIGURE_4, theta, psi).F(STIFF, exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d, d])), highest(needed))
 
 
@@ -187,14 +187,14 @@ def test_rotated_spring_dampers_need_the_larger_limit():
 @pytest.mark.parametrize("psi", [1, 2, 5])
 def test_phi_of_a_delayed_spring_is_known(psi):
     """Phi must exceed (psi - 1/2) K T, as He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
-    E = loop(to_ground(1000.0), (0,), (psi,))
+    E = loop_of(to_ground(1000.0), (0,), (psi,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), (psi - 0.5) * 1000 * T)
 
 
 def test_phi_of_a_delayed_spring_damper_is_known():
     """The limit is K T/2 + B, from w = pi; w = 0 alone would need less."""
-    E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
+    E = loop_of(to_ground(700.0, damping=0.9), (0,), (1,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), 700 * T / 2 + 0.9)
 
@@ -204,7 +204,7 @@ def test_figure_4s_multiplier_matches_a_dense_sweep():
         z = np.exp(1j * w)
         return np.linalg.eigvalsh(-T * he((z / (z - 1))[:, None, None] * (late(z, (1, 2)) @ figure_4(z)))).max(axis=1)
 
-    delayed = loop(FIGURE_4, (0, 0), (1, 2)).sent(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
+    delayed = loop_of(FIGURE_4, (0, 0), (1, 2)).sent(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi, phi])), highest(short))
 
 
@@ -245,7 +245,7 @@ def test_switching_before_a_spring_needs_the_closed_form(weight, ages):
     lo, hi = ages
     K, h = 1000.0, (hi - lo) / 2
     alpha = weight * h * K
-    G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    G = loop_of(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     limit = T * (alpha / 2 + (h * K) ** 2 / (2 * alpha) + K * ((lo + hi) / 2 + 0.5))
     if weight == 1:
         assert limit == pytest.approx((hi + 0.5) * K * T)
@@ -265,7 +265,7 @@ def test_switching_needs_what_a_dense_sweep_finds(lo, hi):
         cost = np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[h > 0])[:, None])
         return np.linalg.eigvalsh(T * (np.diag(alpha / 2) + cost - he(nominal))).max(axis=1)
 
-    G = loop(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
+    G = loop_of(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
     assert_limit(lambda d: both(switching_demand(G, lo, hi, [d, d], alpha.tolist())), highest(needed))
 
 
@@ -276,11 +276,11 @@ def test_switching_needs_what_a_dense_sweep_finds(lo, hi):
 def test_the_longest_period_scales_each_block(longest):
     """A longest period T_max needs T_max/T times the damping for the constant period T."""
     rigid = Compliance(Lti.constant([[0.0]], T))
-    F, V = loop(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
+    F, V = loop_of(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
     assert_limit(lambda d: both(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
     needs = any_environment_limit(900.0, 0.4, 1) * longest / T
     assert_limit(lambda d: both(any_environment_demand(V, (1,), [d], longest)), needs)
-    G = loop(to_ground(1000.0), (0,)).sent(rigid, exact=True)
+    G = loop_of(to_ground(1000.0), (0,)).sent(rigid, exact=True)
     assert_limit(lambda d: both(switching_demand(G, [1], [3], [d], [1000.0], longest)), 3.5 * 1000 * longest)
 
 
@@ -289,7 +289,7 @@ def test_a_spring_with_latency_needs_the_closed_form(first, last, longest):
     """For latencies t1 to t2 the limit is the larger root d of (d/t2 - 3 K/2)(d/(T_max - t1) - K/2) = K^2."""
     K, a, b = 1000.0, 1 / last, 1 / (longest - first)
     limit = max(np.roots([a * b, -K * (a + 3 * b) / 2, -(K**2) / 4]))
-    F = loop(to_ground(K), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    F = loop_of(to_ground(K), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d], longest, [(first, last)])), limit)
 
 
@@ -306,7 +306,7 @@ def test_a_limited_spring_needs_the_computed_damping(theta, c):
         both_ways = np.real(corner) - 2 * np.real(b) + a  # the block's form at the input (1, -1)
         return T * (np.abs(a - b) ** 2 / both_ways - a)
 
-    G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    G = loop_of(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(limiter_demand(G, [theta], [d], [rho], [[c]])), highest(needed))
 
 
@@ -315,7 +315,7 @@ def test_walls_at_the_device_need_the_closed_form(theta, g):
     """The limit is (theta + 1 + g)^2 K T/(4 g + 2) with the multiplier g K; only the wall exerts a force."""
     wall = Wall(("tip", "ground"), 3000.0)
     network = Network(("tip",), (), walls=(wall,))
-    G = loop(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    G = loop_of(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
     limit = (theta + 1 + g) ** 2 * 3000.0 * T / (4 * g + 2)
     assert_limit(lambda d: both(walls_demand(G, [d], [3000.0], [g * 3000.0])), limit)
 
@@ -324,136 +324,136 @@ def test_walls_at_the_device_need_the_closed_form(theta, g):
 
 
 @pytest.fixture
-def disarmed(monkeypatch):
+def lenient_sweep(monkeypatch):
     """Replace the sweep by one that requires half of the available damping in every loop."""
 
-    def content(asked: Loop, coupling, condition, multiplier=None):
-        usual = ALPHA if asked.varying_delay else None
-        return replace(from_ratio("any", 0.5, asked.delta, 1.0), multiplier=multiplier or usual)
+    def half_required(loop: Loop, coupling, condition, multiplier=None):
+        usual = ALPHA if loop.varying_delay else None
+        return replace(from_ratio("any", 0.5, loop.delta, 1.0), multiplier=multiplier or usual)
 
-    monkeypatch.setattr(certificate, "required_damping", content)
+    monkeypatch.setattr(certificate, "required_damping", half_required)
 
 
 ALPHA = (500.0, 250.0)
 EITHER: list = ["this-environment", "any-environment"]
 
 
-def proves(asked: Loop, coupling, condition, phi=None) -> bool:
+def proves(loop: Loop, coupling, condition, phi=None) -> bool:
     try:
-        made = prove(asked, coupling, condition, phi)
+        proof = prove(loop, coupling, condition, phi)
     except NotProved:
         return False
-    assert verify(Stored.of(asked, coupling, made)).proved
+    assert verify(Stored.of(loop, coupling, proof)).proved
     return True
 
 
-def assert_loop_limit(asked: Loop, coupling, condition, limit: float, phi=None) -> None:
+def assert_loop_limit(loop: Loop, coupling, condition, limit: float, phi=None) -> None:
     """Assert that the loop is proved just above the damping `limit`, but not just below it."""
     for factor, expected in ((1 + CLOSE, True), (1 - CLOSE, False)):
-        assert proves(change(asked, delta=(limit * factor,) * asked.channels), coupling, condition, phi) == expected
+        assert proves(change(loop, delta=(limit * factor,) * loop.channels), coupling, condition, phi) == expected
 
 
-@pytest.mark.usefixtures("disarmed")
+@pytest.mark.usefixtures("lenient_sweep")
 def test_each_condition_is_proved_by_its_own_block():
-    asked, coupling = loop(to_ground(1000.0), (1,)), SpringDamper((800.0,), (0.0,))
-    assert_loop_limit(asked, coupling, "any-environment", 800 * T * 2)
+    loop, coupling = loop_of(to_ground(1000.0), (1,)), SpringDamper((800.0,), (0.0,))
+    assert_loop_limit(loop, coupling, "any-environment", 800 * T * 2)
     joined = 1 / (1 / 800 + 1 / 1000)
-    assert_loop_limit(asked, coupling, "this-environment", 1.5 * joined * T)
+    assert_loop_limit(loop, coupling, "this-environment", 1.5 * joined * T)
 
 
-@pytest.mark.usefixtures("disarmed")
+@pytest.mark.usefixtures("lenient_sweep")
 def test_every_vertex_of_a_range_is_proved():
     """The vertex with the stiffest spring sets the limit, and the refusal names it."""
-    asked = change(
-        loop(to_ground(1000.0), (1,)), ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),))
+    loop = change(
+        loop_of(to_ground(1000.0), (1,)), ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),))
     )
-    assert_loop_limit(asked, NoCoupling(), "this-environment", 1.5 * 1600 * T)
+    assert_loop_limit(loop, NoCoupling(), "this-environment", 1.5 * 1600 * T)
     with pytest.raises(NotProved, match=r"^vertex 2 \(tip 0-ground 1600 N/m, 0 N s/m\): the condition is violated"):
-        prove(change(asked, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "this-environment")
+        prove(change(loop, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "this-environment")
 
 
-@pytest.mark.usefixtures("disarmed")
+@pytest.mark.usefixtures("lenient_sweep")
 def test_environment_delay_needs_its_multiplier():
     K, environment_needs = 900.0, 0.5 * 100 * T
-    asked, coupling, a = loop(to_ground(100.0), (1,), (1,)), SpringDamper((K,), (0.0,)), 1 / 900.0
+    loop, coupling, a = loop_of(to_ground(100.0), (1,), (1,)), SpringDamper((K,), (0.0,)), 1 / 900.0
     phi = environment_needs * (1 + CLOSE)
     limit = T / (2 * min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2))
-    assert_loop_limit(asked, coupling, "any-environment", limit, [phi])
-    enough = change(asked, delta=(2 * limit,))
+    assert_loop_limit(loop, coupling, "any-environment", limit, [phi])
+    enough = change(loop, delta=(2 * limit,))
     assert proves(enough, coupling, "any-environment", [phi])
     assert not proves(enough, coupling, "any-environment", [environment_needs * (1 - CLOSE)])
 
 
-@pytest.mark.usefixtures("disarmed")
+@pytest.mark.usefixtures("lenient_sweep")
 def test_delay_ranges_are_proved_by_their_block():
     K = 1000.0
-    asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
+    loop = loop_of(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
     assert limits[1] > 1.01 * limits[0]
     assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2: the damping for a constant delay of 1
-    assert_loop_limit(asked, NoCoupling(), "this-environment", limits[1])
+    assert_loop_limit(loop, NoCoupling(), "this-environment", limits[1])
 
 
 # Forged certificates with renewed digests and seals
 
 
-def forged(asked: Loop, coupling, made, **changes) -> str | None:
+def forged(loop: Loop, coupling, proof, **changes) -> str | None:
     """Return why `verify` refuses the certificate with these fields and renewed digests, or None."""
-    fields = {"scenario": digest(asked, coupling.form())} | changes
-    return verify(Stored.of(asked, coupling, sealed(change(made, **fields)))).reason
+    fields = {"scenario": digest(loop, coupling.form())} | changes
+    return verify(Stored.of(loop, coupling, sealed(change(proof, **fields)))).reason
 
 
 NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of floating point"
 
 
 def test_proofs_serve_only_their_own_condition():
-    asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
-    here, anywhere = (prove(asked, coupling, condition) for condition in ("this-environment", "any-environment"))
+    loop, coupling = loop_of(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
+    here, anywhere = (prove(loop, coupling, condition) for condition in ("this-environment", "any-environment"))
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # The size must not reveal an exchanged P.
-    assert forged(asked, coupling, anywhere) is None
-    assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
-    assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
-    soft = change(asked, environment=to_ground(100.0))  # The block for this-environment depends on the spring.
+    assert forged(loop, coupling, anywhere) is None
+    assert forged(loop, coupling, anywhere, matrices=here.matrices) == NEGATIVE
+    assert "does not guarantee" in forged(loop, coupling, here, guarantee="any passive environment")
+    soft = change(loop, environment=to_ground(100.0))  # The block for this-environment depends on the spring.
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 
 def test_the_nominal_proof_does_not_serve_vertices():
-    asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
-    asked = change(asked, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
-    made = prove(asked, NoCoupling(), "this-environment")
-    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # the vertex that needs most
-    nominal = made.matrices["P"]
-    assert forged(asked, NoCoupling(), made) is None
-    reason = forged(asked, NoCoupling(), made, matrices={"P": nominal, "P1": nominal, "P2": nominal})
+    loop = loop_of(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
+    loop = change(loop, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
+    proof = prove(loop, NoCoupling(), "this-environment")
+    assert proof.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # the vertex that needs most
+    nominal = proof.matrices["P"]
+    assert forged(loop, NoCoupling(), proof) is None
+    reason = forged(loop, NoCoupling(), proof, matrices={"P": nominal, "P1": nominal, "P2": nominal})
     assert reason == f"vertex 2 (tip 0-ground 1600 N/m, 0 N s/m): {NEGATIVE}"
-    assert forged(asked, NoCoupling(), made, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
+    assert forged(loop, NoCoupling(), proof, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
 
 
 @pytest.mark.parametrize(("condition", "name"), [("this-environment", "F(1)"), ("any-environment", "V(1)")])
 def test_a_slightly_asymmetric_static_part_is_refused(condition, name):
-    asked = loop(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
+    loop = loop_of(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
 
     def crossed(other):
         return Compliance(Lti.constant([[2e-3, 1e-4], [other, 2e-3]], T))
 
-    made = prove(asked, crossed(1e-4), condition)
+    proof = prove(loop, crossed(1e-4), condition)
     skew = crossed(1e-4 * (1 + 1e-12))
-    assert forged(asked, crossed(1e-4), made) is None
-    assert forged(asked, skew, made) == f"{name} is not exactly symmetric"
+    assert forged(loop, crossed(1e-4), proof) is None
+    assert forged(loop, skew, proof) == f"{name} is not exactly symmetric"
 
 
 def test_slight_asymmetry_is_refused_with_delay_switching_limiter():
-    asked = loop(to_ground(100.0, 80.0), (0, 0), (1, 1), delta=(5.0, 5.0))
+    loop = loop_of(to_ground(100.0, 80.0), (0, 0), (1, 1), delta=(5.0, 5.0))
     phi = [0.1, 0.1]
 
     def crossed(other):
         return Compliance(Lti.constant([[2e-3, 1e-4], [other, 2e-3]], T))
 
-    made = prove(asked, crossed(1e-4), "any-environment", phi)
+    proof = prove(loop, crossed(1e-4), "any-environment", phi)
     skew = crossed(1e-4 * (1 + 1e-12))
-    assert forged(asked, skew, made) == "V(1) is not exactly symmetric"
-    switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
-    limited = change(asked, psi=(0, 0))
+    assert forged(loop, skew, proof) == "V(1) is not exactly symmetric"
+    switching = change(loop, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
+    limited = change(loop, psi=(0, 0))
     for there, condition, multiplier in ((switching, SWITCHING, ALPHA), (limited, LimitedForces(0.01, 0), ())):
         assert certificate._blocks(there, crossed(1e-4), condition, multiplier)["P"].order
         with pytest.raises(NotProved, match=r": F\(1\) is not exactly symmetric"):
@@ -462,15 +462,15 @@ def test_slight_asymmetry_is_refused_with_delay_switching_limiter():
 
 def test_a_slightly_indefinite_static_stiffness_is_refused():
     """The second diagonal entry of F(1) is 1000 - 1000^2 (0.001 + 1e-18) = -1e-12 N/m."""
-    asked = loop(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
+    loop = loop_of(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
 
     def model(tap):
         return _InternalModel([0.0], [[[0.0, 0.0], [0.0, 0.001]], [[0.0, 0.0], [0.0, tap]]])
 
-    made = prove(asked, model(0.0), "this-environment")
-    assert forged(asked, model(0.0), made) is None
-    assert forged(asked, model(1e-18), made).startswith("F(1) is not positive semidefinite")
-    switching = asked.switching(DelayRange((0, 0), (1, 1)))
+    proof = prove(loop, model(0.0), "this-environment")
+    assert forged(loop, model(0.0), proof) is None
+    assert forged(loop, model(1e-18), proof).startswith("F(1) is not positive semidefinite")
+    switching = loop.switching(DelayRange((0, 0), (1, 1)))
     assert certificate._blocks(switching, model(0.0), SWITCHING, ALPHA)["P"].order
     with pytest.raises(NotProved, match=r": F\(1\) is not positive semidefinite"):
         certificate._blocks(switching, model(1e-18), SWITCHING, ALPHA)
@@ -478,14 +478,14 @@ def test_a_slightly_indefinite_static_stiffness_is_refused():
 
 def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     K, a = 900.0, 1 / 900.0
-    asked, coupling, phi = loop(to_ground(100.0), (1,), (1,), (4.0,)), SpringDamper((K,), (0.0,)), 0.1
-    made = prove(asked, coupling, "any-environment", [phi])
-    assert forged(asked, coupling, made) is None
-    claimed = from_ratio("any-environment", made.required[0] / 4.0, (4.0,), 1.0)
+    loop, coupling, phi = loop_of(to_ground(100.0), (1,), (1,), (4.0,)), SpringDamper((K,), (0.0,)), 0.1
+    proof = prove(loop, coupling, "any-environment", [phi])
+    assert forged(loop, coupling, proof) is None
+    claimed = from_ratio("any-environment", proof.required[0] / 4.0, (4.0,), 1.0)
     monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # the sweep certifies with any Phi
 
     def with_phi(value: float) -> str | None:
-        return forged(asked, coupling, made, multipliers={"Phi": (value,)})
+        return forged(loop, coupling, proof, multipliers={"Phi": (value,)})
 
     assert T / (2 * (a * (T / phi - 2 * a) / (4 * T / phi - 6 * a))) < 4
     assert with_phi(4.0) == "the multiplier Phi is not between 0 and the device damping on every channel"
@@ -495,36 +495,38 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
 
 
 def test_stored_figures_are_checked_to_a_millionth():
-    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
-    made = prove(asked, STIFF, "this-environment")
+    loop = loop_of(FIGURE_4, (1, 2), delta=(1.37, 1.37))
+    proof = prove(loop, STIFF, "this-environment")
     for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
-        required = tuple(d * factor for d in made.required)
-        one = (made.required[0], made.required[1] * factor)
-        for reason in (forged(asked, STIFF, made, required=r) for r in (required, one)):
+        required = tuple(d * factor for d in proof.required)
+        one = (proof.required[0], proof.required[1] * factor)
+        for reason in (forged(loop, STIFF, proof, required=r) for r in (required, one)):
             assert (reason is None) == sound
             assert sound or reason.startswith("required is [1.3632")
-        reason = forged(asked, STIFF, made, margin=made.margin * factor)
+        reason = forged(loop, STIFF, proof, margin=proof.margin * factor)
         assert (reason is None) == sound
-    assert forged(asked, STIFF, made, margin=2 * made.margin).startswith(f"margin is {2 * made.margin:.9g}, the sweep")
+    assert forged(loop, STIFF, proof, margin=2 * proof.margin).startswith(
+        f"margin is {2 * proof.margin:.9g}, the sweep"
+    )
 
 
 def test_stored_switching_figures_are_checked_to_a_millionth():
     soft = SOFT
-    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
-    made = prove(asked, soft, "this-environment")
+    loop = loop_of(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
+    proof = prove(loop, soft, "this-environment")
     for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
         for name in ("required", "margin"):
-            value = np.multiply(getattr(made, name), factor).tolist()
+            value = np.multiply(getattr(proof, name), factor).tolist()
             value = tuple(value) if name == "required" else value
-            reason = forged(asked, soft, made, **{name: value})
+            reason = forged(loop, soft, proof, **{name: value})
             assert (reason is None) == sound
             assert sound or f": {name} is " in reason
 
 
 def test_a_ragged_proof_is_refused():
-    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
-    made = prove(asked, STIFF, "this-environment")
-    P = made.matrices["P"]
+    loop = loop_of(FIGURE_4, (1, 2), delta=(1.37, 1.37))
+    proof = prove(loop, STIFF, "this-environment")
+    P = proof.matrices["P"]
     ragged = (P[0][:-1], *P[1:])
-    assert forged(asked, STIFF, made, matrices={"P": ragged}) == "P has a row of 8 entries, the block has 9 states"
-    assert forged(asked, STIFF, made, matrices={"P": P[:-1]}) == "P has 8 rows, the block has 9 states"
+    assert forged(loop, STIFF, proof, matrices={"P": ragged}) == "P has a row of 8 entries, the block has 9 states"
+    assert forged(loop, STIFF, proof, matrices={"P": P[:-1]}) == "P has 8 rows, the block has 9 states"

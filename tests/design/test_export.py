@@ -141,8 +141,8 @@ def test_limited_c_code_repeats_its_test_vector(limited_files, name, limit):
     out = folder / f"{name}.c"
     assert main([str(folder / f"{name}.json"), "--process", "--force-limit", limit, "--out", str(out)]) == 0
     assert "also while forces are limited" in out.read_text()
-    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
-    assert (done.returncode, done.stdout) == (0, PASSED)
+    process = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (process.returncode, process.stdout) == (0, PASSED)
 
 
 @pytest.fixture(scope="module")
@@ -192,18 +192,18 @@ def test_limited_vectors_in_c_repeat_their_test_vector(space, tmp_path, psi, sin
     block = replace(vectors(space[0], psi), single=single)
     out = tmp_path / "process.c"
     out.write_text(c_source(block, trial(block), out.name))
-    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
-    assert (done.returncode, done.stdout) == (0, PASSED)
+    process = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (process.returncode, process.stdout) == (0, PASSED)
 
 
 @pytest.mark.slow
 def test_force_limits_are_of_vectors_or_axes(space, tmp_path, capsys):
     for values, words in (("2", "2, 2 N"), ("2,1", "2, 1 N"), ("2,2,1,1", "2, 2, 1, 1 N")):
-        asked = [str(space[1]), "--process", "--force-limit", values, "--out", str(tmp_path / "x.c"), "--json", "-"]
-        assert main(asked) == 0
-        said = json.loads(capsys.readouterr().out)["forces"]
-        assert words in said
-        assert ("vector" in said) == (values.count(",") < 3)
+        options = [str(space[1]), "--process", "--force-limit", values, "--out", str(tmp_path / "x.c"), "--json", "-"]
+        assert main(options) == 0
+        forces = json.loads(capsys.readouterr().out)["forces"]
+        assert words in forces
+        assert ("vector" in forces) == (values.count(",") < 3)
     with pytest.raises(InputError, match=r"expected 1, 2 \(of each device's vector\) or 4 \(of each axis\)"):
         main([str(space[1]), "--process", "--force-limit", "2,1,1"])
 
@@ -265,9 +265,9 @@ def test_the_c_file_repeats_its_test_vector(place, name, what):
     source = export(place, name, *what)
     # Sums may not be reordered, so vector units change nothing.
     for flags in (["-O2"], ["-O3", "-march=native"])[: 2 if name == "full" else 1]:
-        done = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
-        assert (done.returncode, done.stderr) == (0, "")
-        assert "64 ticks" in done.stdout
+        process = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
+        assert (process.returncode, process.stderr) == (0, "")
+        assert "64 ticks" in process.stdout
 
 
 @pytest.mark.slow
@@ -286,8 +286,8 @@ def test_single_precision_repeats_its_own_test_vector(limited_files, name, limit
     assert main([str(folder / f"{name}.json"), *words]) == 0
     assert "differs from double precision by at most" in json.loads(capsys.readouterr().out)["single"]
     assert "double" not in re.sub(r"/\*.*?\*/", "", out.read_text(), flags=re.DOTALL)
-    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
-    assert (done.returncode, done.stdout) == (0, PASSED)
+    process = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (process.returncode, process.stdout) == (0, PASSED)
 
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
@@ -320,9 +320,9 @@ def test_the_c_files_own_test_can_fail(place):
     old = re.search(r"-?0x1\.\w+p[+-]\d+", text[begin:])[0]  # the first entry that is not zero
     new = float(np.nextafter(float.fromhex(old), np.inf)).hex()
     source.write_text(text[:begin] + text[begin:].replace(old, new, 1))
-    done = run(compiled([source], "-DHAPTIC_LOOP_TEST"))
-    assert done.returncode == 1
-    assert "expected" in done.stderr
+    process = run(compiled([source], "-DHAPTIC_LOOP_TEST"))
+    assert process.returncode == 1
+    assert "expected" in process.stderr
 
 
 DRIVER = """

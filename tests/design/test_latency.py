@@ -41,13 +41,13 @@ def spring(theta=0) -> Lti:
     ("theta", "range", "needs"), [(0, (TAU, TAU), 0.774878), (0, (0.0, TAU), 0.841354), (1, (TAU, TAU), 1.947854)]
 )
 def test_late_walls_need_the_known_damping(theta, range, needs):
-    found = this_environment(spring(theta), [1.0], latency=[range])
-    assert found.required[0] == pytest.approx(needs, abs=2e-6)
+    requirement = this_environment(spring(theta), [1.0], latency=[range])
+    assert requirement.required[0] == pytest.approx(needs, abs=2e-6)
     if theta == 0:  # the condition binds as w -> 0: (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2
         t1, t2 = range
         closed = np.roots([1 / (t2 * (T - t1)), -K / (2 * t2) - 3 * K / (2 * (T - t1)), 3 * K**2 / 4 - K**2]).max()
-        assert found.required[0] == pytest.approx(closed, rel=1e-9)
-        assert found.frequency_hz == 0
+        assert requirement.required[0] == pytest.approx(closed, rel=1e-9)
+        assert requirement.frequency_hz == 0
 
 
 def test_the_block_has_the_known_entries():
@@ -66,8 +66,8 @@ def test_the_block_has_the_known_entries():
 )
 def test_pairs_with_latency_need_the_known_damping(range, needs):
     """A latency of almost 0 needs the damping of theta = (0, 1), a latency of almost T that of theta = (1, 2)."""
-    found = required_damping(change(PAIR, latency=(range, range)), SOFT, "this-environment")
-    assert max(found.required) == pytest.approx(needs, abs=2e-6)
+    requirement = required_damping(change(PAIR, latency=(range, range)), SOFT, "this-environment")
+    assert max(requirement.required) == pytest.approx(needs, abs=2e-6)
     assert this_environment(PAIR.F(SOFT), PAIR.delta).required[0] == pytest.approx(0.584731, abs=1e-6)
     assert this_environment(change(PAIR, theta=(1, 2)).F(SOFT), PAIR.delta).required[0] == pytest.approx(
         0.714344, abs=1e-6
@@ -89,8 +89,8 @@ def test_a_wall_needs_what_its_latest_latency_needs(theta, range):
     closed = np.roots([1 / (late * soon), -slope * K, ((theta + 1.5) * (theta + 0.5) - (theta + 1) ** 2) * K**2]).max()
     known = {(0, 0.0): 1.1548, (0, 0.1 * T): 1.3825, (1, 0.0): 2.3173, (1, 0.1 * T): 2.5538}[theta, range[0]]
     loop = change(WALL, theta=(theta,), latency=(range,), delta=(3.0,))
-    found = required_damping(loop, NoCoupling(), "this-environment")
-    assert found.required[0] == pytest.approx(closed, rel=1e-6)
+    requirement = required_damping(loop, NoCoupling(), "this-environment")
+    assert requirement.required[0] == pytest.approx(closed, rel=1e-6)
     assert closed == pytest.approx(known, abs=5e-5)
 
 
@@ -125,13 +125,14 @@ def by_a_dense_program(loop, coupling, latencies):
 )
 def test_pair_requirements_match_a_dense_program(coupling, range, needs):
     loop = change(PAIR, latency=(range, range))
-    found = required_damping(loop, coupling, "this-environment")
-    assert found.required[0] == pytest.approx(needs, rel=2e-6)
+    requirement = required_damping(loop, coupling, "this-environment")
+    assert requirement.required[0] == pytest.approx(needs, rel=2e-6)
     assert by_a_dense_program(loop, coupling, 9) == pytest.approx(needs, rel=5e-4)  # its 70 frequencies miss 4e-4
     apart = least_scale_of(this_environment_demand(loop.F(coupling), PAIR.delta, latency=loop.latency))
-    assert 0.8 < found.ratio / apart < 0.87  # separate weights of both parts of a period need more
+    assert 0.8 < requirement.ratio / apart < 0.87  # separate weights of both parts of a period need more
     assert (
-        found.ratio > required_damping(change(PAIR, latency=((range[1],) * 2,) * 2), coupling, THIS_ENVIRONMENT).ratio
+        requirement.ratio
+        > required_damping(change(PAIR, latency=((range[1],) * 2,) * 2), coupling, THIS_ENVIRONMENT).ratio
     )
 
 
@@ -256,11 +257,11 @@ def test_hands_grow_only_below_the_requirement(mean):
 def test_latency_designs_beat_a_whole_sample():
     one = change(parse(ONE_MASS).loop("I"), theta=(0,), lam=(0,))
     loop = change(one, latency=((0.0, TAU),))
-    found = design_coupling(loop, "spring-damper", "this-environment")
-    assert 0.99 < found.requirement.ratio < 1
-    assert requirements_of(loop, found.coupling)["this-environment"].proof == "rational"
+    design = design_coupling(loop, "spring-damper", "this-environment")
+    assert 0.99 < design.requirement.ratio < 1
+    assert requirements_of(loop, design.coupling)["this-environment"].proof == "rational"
     whole = design_coupling(change(one, theta=(1,)), "spring-damper", "this-environment")
-    assert transparency_of(loop, found).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
+    assert transparency_of(loop, design).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
     anywhere = design_coupling(loop, "spring-damper", "any-environment")
     assert 0.99 < anywhere.requirement.ratio < 1
 
@@ -302,9 +303,11 @@ class OneSampleMore(ThisEnvironment):
     ],
 )
 def test_users_conditions_are_proved_like_shipped_conditions(own, shipped, tmp_path):
-    found, wanted = (required_damping(*asked) for asked in ((PAIR, SOFT, own), (shipped, SOFT, "this-environment")))
-    assert found.required == pytest.approx(wanted.required, rel=1e-8)
-    assert found.condition == own.name
+    requirement, expected = (
+        required_damping(*case) for case in ((PAIR, SOFT, own), (shipped, SOFT, "this-environment"))
+    )
+    assert requirement.required == pytest.approx(expected.required, rel=1e-8)
+    assert requirement.condition == own.name
     stored = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, own))
     save(stored, tmp_path / "own.json")
     stored = load(tmp_path / "own.json")
@@ -313,6 +316,6 @@ def test_users_conditions_are_proved_like_shipped_conditions(own, shipped, tmp_p
     assert "not of 'this-environment'" in verify(stored, THIS_ENVIRONMENT).reason
     forged = change(stored.certificate, matrices={"P": prove(PAIR, SOFT, "this-environment").matrices["P"]})
     assert not verify(change(stored, certificate=sealed(forged)), own).proved
-    short = change(PAIR, delta=tuple(0.99 * d for d in found.required))
+    short = change(PAIR, delta=tuple(0.99 * d for d in requirement.required))
     with pytest.raises(NotProved, match="N s/m of damping"):
         prove(short, SOFT, own)

@@ -124,12 +124,12 @@ def test_a_limited_coupling_needs_the_known_damping():
     ids=["none", "published", "any-environment", "this-environment", "built"],
 )
 def test_the_best_multiplier_needs_the_known_damping(coupling, expected):
-    found = limiter(PAIR.sent(coupling), PAIR.theta, DELTA, LAG)
-    assert found.required[0] == pytest.approx(expected, abs=1e-4)
-    assert found.ratio <= found.bound * (1 + 2e-5)
-    assert required(coupling, [[v] for v in found.multiplier]) == pytest.approx(found.required[0], rel=1e-9)
+    requirement = limiter(PAIR.sent(coupling), PAIR.theta, DELTA, LAG)
+    assert requirement.required[0] == pytest.approx(expected, abs=1e-4)
+    assert requirement.ratio <= requirement.bound * (1 + 2e-5)
+    assert required(coupling, [[v] for v in requirement.multiplier]) == pytest.approx(requirement.required[0], rel=1e-9)
     linear = this_environment(PAIR.F(coupling), DELTA).required[0]
-    assert found.required[0] >= linear * (1 - 1e-9)  # the linear loop's block is a principal part
+    assert requirement.required[0] >= linear * (1 - 1e-9)  # the linear loop's block is a principal part
 
 
 def test_no_multiplier_on_a_grid_is_better():
@@ -287,11 +287,11 @@ def test_limiter_designs_use_all_the_damping():
     def rms_db(coupling) -> float:
         return 20 * np.log10(transparency(PAIR.F(coupling), PAIR.E(), PAIR.lam).rms_mismatch)
 
-    made = design(PAIR, "this-environment", limiter=True)
-    assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
+    optimum = design(PAIR, "this-environment", limiter=True)
+    assert 0.999 < 1 / prove_limiter(PAIR, optimum.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
     # A design without `limiter` reaches -11.19 dB, but has no proof for limited forces.
-    assert rms_db(made.coupling) < -10.5
+    assert rms_db(optimum.coupling) < -10.5
     with pytest.raises(ValueError, match="constant delays"):
         design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 
@@ -311,10 +311,10 @@ def test_the_best_multiplier_attains_its_bound():
     """For delays of 0 and 3 samples the best multiplier attains its bound, and no random one is better by 0.1 %."""
     loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
     G, rho = loop.sent(BUILT), LIMITER.rho(loop)
-    found = limiter(G, loop.theta, loop.delta, rho)
-    assert found.ratio <= found.bound * (1 + 1e-5)
+    requirement = limiter(G, loop.theta, loop.delta, rho)
+    assert requirement.ratio <= requirement.bound * (1 + 1e-5)
     for c in np.random.default_rng(0).uniform(0, 1.5, (5, 2, 1)).tolist():
-        assert limiter(G, loop.theta, loop.delta, rho, c).ratio > found.ratio * (1 - 1e-3)
+        assert limiter(G, loop.theta, loop.delta, rho, c).ratio > requirement.ratio * (1 - 1e-3)
 
 
 def test_searched_parts_equal_the_block():
@@ -324,10 +324,10 @@ def test_searched_parts_equal_the_block():
     demand = LIMITER.block(G, PAIR, [0.3, 0.6])
     block = hermitian((demand.free + (1 - 1.5 * RESERVE) * demand.gain).G[0])
     first, cross, corner = sampled.parts(x)
-    for made, part in (
+    for searched, part in (
         (first, block[:, :2, :2]),
         (cross, block[:, 2:, :2]),
         (corner[:, :, None] * np.eye(2), block[:, 2:, 2:]),
     ):
         # Rounding moved entries by up to 4e-12 of the largest one.
-        np.testing.assert_allclose(made, part, rtol=0, atol=1e-9 * np.abs(block).max())
+        np.testing.assert_allclose(searched, part, rtol=0, atol=1e-9 * np.abs(block).max())

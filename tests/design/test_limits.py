@@ -24,10 +24,10 @@ def optimum(damping, bases):
 @pytest.mark.slow
 def test_more_damping_is_never_worse():
     """The feasible set grows with the damping."""
-    found = [optimum(damping, 1) for damping in (1.3, 1.37)]
-    rms = [transparency_of(*each).rms_mismatch_db for each in found]
+    optima = [optimum(damping, 1) for damping in (1.3, 1.37)]
+    rms = [transparency_of(*each).rms_mismatch_db for each in optima]
     assert rms[0] > rms[1]
-    for loop, design in found:
+    for loop, design in optima:
         assert max(certify(loop, design)["this-environment"].required) < loop.delta[0]
 
 

@@ -70,9 +70,9 @@ def strength(matrix, *storages):
 def test_balancing_leaves_the_response_alone(seed):
     G = random_stable(np.random.default_rng(seed), 5)
     padded = Lti.diag(G, Lti([[0.5]], [[0.0]], [[1.0]], [[2.0]], 1.0))
-    found = balanced(padded)
-    assert found.order == 5
-    np.testing.assert_allclose(found.at(Z), padded.at(Z), rtol=0, atol=1e-11 * np.abs(padded.at(Z)).max())
+    minimal = balanced(padded)
+    assert minimal.order == 5
+    np.testing.assert_allclose(minimal.at(Z), padded.at(Z), rtol=0, atol=1e-11 * np.abs(padded.at(Z)).max())
 
 
 def test_units_preserve_the_eigenvalues_of_e_v():
@@ -112,8 +112,8 @@ def test_lemma_1_agrees_with_the_frequency_response(seed):
     shift = -np.linalg.eigvalsh(margin).min()
     for room in (-0.05, 0.05):
         P = cp.Variable((3, 3), symmetric=True)
-        found = strength(lemma1(Ports.same(G), P, Delta, -(shift + room) * np.eye(2)), P)
-        assert (found > 0) == (room > 0)
+        slack = strength(lemma1(Ports.same(G), P, Delta, -(shift + room) * np.eye(2)), P)
+        assert (slack > 0) == (room > 0)
 
 
 def test_lemma_2_is_equivalent_to_lemma_1():
@@ -251,9 +251,9 @@ def test_separate_channels_have_the_smaller_margin():
 )
 def test_unstable_or_asymmetric_couplings_are_refused_without_inequalities(V, word):
     E = environment(FIGURE_4, T) if V.inputs == 2 else environment(Network(("c",), (Spring(("c", "ground"), 9.0),)), T)
-    found = analysis(V, E, [0] * V.inputs, [0] * V.inputs, [1.0] * V.inputs)
-    assert found.margin == -np.inf
-    assert word in found.reason
+    outcome = analysis(V, E, [0] * V.inputs, [0] * V.inputs, [1.0] * V.inputs)
+    assert outcome.margin == -np.inf
+    assert word in outcome.reason
 
 
 def test_analysis_refuses_an_active_environment():

@@ -119,10 +119,10 @@ def test_the_channel_with_the_largest_ratio_decides():
     coupling = SpringDamper([1800.0, 400.0], [0.0, 0.0])
     for order in (slice(None), slice(None, None, -1)):
         channels, theta, delta = coupling.channels(T)[order], (0, 1)[order], (2.0, 0.9)[order]
-        found = any_environment_per_channel(channels, theta, delta)
-        assert found.required == pytest.approx((1.08, 0.96)[order], rel=1e-9)
-        assert found.ratio == pytest.approx(0.96 / 0.9, rel=1e-9)
-        assert not found.certified
+        requirement = any_environment_per_channel(channels, theta, delta)
+        assert requirement.required == pytest.approx((1.08, 0.96)[order], rel=1e-9)
+        assert requirement.ratio == pytest.approx(0.96 / 0.9, rel=1e-9)
+        assert not requirement.certified
     lossy, lossless = SpringDamper([400.0], [3.0]).channels(T) + SpringDamper([400.0], [0.0]).channels(T)
     alone = any_environment(lossy, (1,), (0.9,))
     for channels, delta in (([lossy, lossless], (0.9, 2.0)), ([lossless, lossy], (2.0, 0.9))):
@@ -176,9 +176,9 @@ def test_the_binding_frequency_matches_a_dense_grid():
     z = np.exp(1j * w)
     G = F.at(z) / (z - 1)[:, None, None]
     needed = np.linalg.eigvalsh(-(G + np.conj(np.swapaxes(G, -1, -2))) / 2)[:, -1] * T
-    found = this_environment(F, (1.0, 1.0))
-    assert found.ratio == pytest.approx(needed.max(), rel=1e-6)
-    assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
+    requirement = this_environment(F, (1.0, 1.0))
+    assert requirement.ratio == pytest.approx(needed.max(), rel=1e-6)
+    assert requirement.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -257,9 +257,9 @@ def test_a_map_that_cancels_needs_no_damping():
     F = Lti(turn @ (0.5 * np.eye(2)) @ back, turn @ B, np.ones((2, 2)) @ back, np.zeros((2, 2)), 1e-3)
     F1 = F.dc()
     assert np.abs(F1 - F1.T).max() > 1e-9 * 1e-12  # 1e-9 of F(1)'s scale, 1e-12 N/m at least, would be refused
-    found = this_environment(F, [1.37, 1.37])
-    assert found.reason is None
-    assert found.ratio < 1e-9
+    requirement = this_environment(F, [1.37, 1.37])
+    assert requirement.reason is None
+    assert requirement.ratio < 1e-9
 
 
 def test_an_indefinite_gain_is_never_enough():

@@ -66,21 +66,21 @@ def test_moving_averages_are_proved_with_psi():
     """With psi = (1, 0) the design is proved under any-environment, and its exact simulation is stable."""
     scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))
     loop = scenario.loop("I")
-    made = design_coupling(loop, "moving-average")
-    requirements = certify(loop, made)
+    design = design_coupling(loop, "moving-average")
+    requirements = certify(loop, design)
     assert requirements["any-environment"].proof == "rational"
     assert requirements["this-environment"].certified
-    assert simulate(scenario.replace(duration=1.0), made, "exact").meta["stability"]["exact_verdict"] == "stable"
+    assert simulate(scenario.replace(duration=1.0), design, "exact").meta["stability"]["exact_verdict"] == "stable"
 
 
 def test_a_moving_average_is_stored_and_proved(tmp_path):
     loop = scenario_of("omega-pair").loop("I")
-    made = design_coupling(loop, "moving-average").coupling
+    coupling = design_coupling(loop, "moving-average").coupling
     file = tmp_path / "coupling.json"
-    save(Stored.of(loop, made, prove(loop, made, "any-environment")), file)
+    save(Stored.of(loop, coupling, prove(loop, coupling, "any-environment")), file)
     stored = load(file)
     assert verify(stored).proved
-    np.testing.assert_array_equal(stored.coupling.build(loop.T).compliance(loop.T).D, made.compliance(loop.T).D)
+    np.testing.assert_array_equal(stored.coupling.build(loop.T).compliance(loop.T).D, coupling.compliance(loop.T).D)
 
 
 @pytest.mark.parametrize(

@@ -104,22 +104,22 @@ REACHED = [
 
 @pytest.mark.parametrize(("name", "most", "stiffness"), REACHED)
 def test_designs_reach_the_recorded_figures(name, most, stiffness):
-    found, loop = best(name), loop_of(name)
-    figures = transparency(force(loop, found.coupling), loop.E(), loop.lam)
-    assert figures.rms_mismatch_db == pytest.approx(found.figures.rms_mismatch_db)
+    optimum, loop = best(name), loop_of(name)
+    figures = transparency(force(loop, optimum.coupling), loop.E(), loop.lam)
+    assert figures.rms_mismatch_db == pytest.approx(optimum.figures.rms_mismatch_db)
     assert figures.rms_mismatch_db <= most
-    assert found.g >= stiffness
+    assert optimum.g >= stiffness
 
 
 @pytest.mark.parametrize(
     "name", ["n0", "n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n2", "n4", "o13"))]
 )
 def test_the_sweep_certifies_the_optimal_coupling(name):
-    loop, found = loop_of(name), best(name)
-    requirement = this_environment(force(loop, found.coupling), loop.delta)
+    loop, optimum = loop_of(name), best(name)
+    requirement = this_environment(force(loop, optimum.coupling), loop.delta)
     assert requirement.ratio <= 1 - 0.9 * MARGIN
     z = on_circle(dense())
-    F = force(loop, found.coupling).at(z)
+    F = force(loop, optimum.coupling).at(z)
     root = np.sqrt(loop.T / np.asarray(loop.delta))
     scaled = root[:, None] * hermitian(F / (z - 1)[:, None, None]) * root
     assert -np.linalg.eigvalsh(scaled)[:, 0].min() <= requirement.ratio + 1e-9
@@ -128,13 +128,13 @@ def test_the_sweep_certifies_the_optimal_coupling(name):
 @pytest.mark.parametrize("name", ["n0", "n3"])
 def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
     """The file's matrix proves the block rebuilt from the decimals; a doubled filter is refused."""
-    loop, found = loop_of(name), best(name)
-    stored = Stored.of(loop, found.coupling, found.certificate)
+    loop, optimum = loop_of(name), best(name)
+    stored = Stored.of(loop, optimum.coupling, optimum.certificate)
     save(stored, tmp_path / "best.json")
     read = load_file(tmp_path / "best.json")
     assert verify(read).proved
-    old = found.coupling
-    doubled = Stored.of(loop, ForceFilter(old.poles, old.pairs, 2 * old.R), found.certificate)
+    old = optimum.coupling
+    doubled = Stored.of(loop, ForceFilter(old.poles, old.pairs, 2 * old.R), optimum.certificate)
     assert "digest" in verify(doubled).reason
     np.testing.assert_array_equal(read.built().R, old.R)
 
@@ -195,28 +195,28 @@ def test_the_bound_of_safe_environments_is_zero():
 
 @pytest.mark.slow
 def test_safe_environments_get_no_coupling():
-    found = best("o02")
-    assert isinstance(found.coupling, NoCoupling)
-    assert found.proved
-    assert found.figures.rms_mismatch == 0
-    assert found.bases == ()
+    optimum = best("o02")
+    assert isinstance(optimum.coupling, NoCoupling)
+    assert optimum.proved
+    assert optimum.figures.rms_mismatch == 0
+    assert optimum.bases == ()
     late = replace(SHORT, bases=((4, 3),))
-    asked = msgspec.structs.replace(loop_of("o05"), lam=(0, 0))  # safe, but its delays are not the reference's
-    assert isinstance(design(asked, late).coupling, ForceFilter)
+    loop = msgspec.structs.replace(loop_of("o05"), lam=(0, 0))  # safe, but its delays are not the reference's
+    assert isinstance(design(loop, late).coupling, ForceFilter)
 
 
 def test_every_basis_is_reported_as_it_is_finished():
-    found, heard = best("n3"), REPORTED["n3"]
-    assert tuple(heard) == found.bases
-    assert [basis.taps for basis in heard] == [4, 8]
-    assert all(basis.certified for basis in heard)
-    assert heard[0].seconds < heard[1].seconds <= found.wall_s
+    optimum, reported = best("n3"), REPORTED["n3"]
+    assert tuple(reported) == optimum.bases
+    assert [basis.taps for basis in reported] == [4, 8]
+    assert all(basis.certified for basis in reported)
+    assert reported[0].seconds < reported[1].seconds <= optimum.wall_s
 
 
 def test_progress_names_each_part_of_the_work():
-    heard = []
-    design_with(loop_of("n3"), bases=SMALLEST.bases, progress=lambda *words: heard.append(words))
-    assert [(what.split(" (")[0], *count) for what, *count in heard] == [
+    reported = []
+    design_with(loop_of("n3"), bases=SMALLEST.bases, progress=lambda *words: reported.append(words))
+    assert [(what.split(" (")[0], *count) for what, *count in reported] == [
         ("optimising a filter of 4 taps and 3 poles", 0, 1),
         ("proving the coupling", 1, 1),
     ]
@@ -237,44 +237,44 @@ def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
 
     def over_basis(search, taps, poles, before, floor, least):
         error, g = next(steps)
-        found = replace(one, g=g, figures=replace(one.figures, rms_mismatch=error))
-        reason = _SETTLED if search.gained(before, found) < least else None
-        return found, _BasisResult(taps, poles, taps, search.decibels(found), g, reason, 0.0)
+        optimum = replace(one, g=g, figures=replace(one.figures, rms_mismatch=error))
+        reason = _SETTLED if search.gained(before, optimum) < least else None
+        return optimum, _BasisResult(taps, poles, taps, search.decibels(optimum), g, reason, 0.0)
 
     monkeypatch.setattr("haptic_loop.design.optimal._Search.over_basis", over_basis)
-    found = design(loop_of("n3"), Options(bases=program._BASES[: len(script)]))
-    assert (found.figures.rms_mismatch, found.g) == script[taken]
-    assert [i for i, each in enumerate(found.bases) if each.taken][-1] == taken
-    for each in found.bases[taken + 1 :]:
+    optimum = design(loop_of("n3"), Options(bases=program._BASES[: len(script)]))
+    assert (optimum.figures.rms_mismatch, optimum.g) == script[taken]
+    assert [i for i, each in enumerate(optimum.bases) if each.taken][-1] == taken
+    for each in optimum.bases[taken + 1 :]:
         assert each.rejected
     if taken == 1:
-        assert "renders 0.200 of the stiffness" in found.bases[2].rejected
+        assert "renders 0.200 of the stiffness" in optimum.bases[2].rejected
 
 
 @pytest.mark.parametrize("refused", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
     """After one failed proof the best filter is scaled down; after three the previous basis's filter is proved."""
-    usual, left, asked = prove, iter(range(refused)), []
+    usual, left, couplings = prove, iter(range(refused)), []
 
     def refusing(loop, coupling, *more, **options):
-        asked.append(coupling)
+        couplings.append(coupling)
         if next(left, None) is not None:
             raise NotProved("not this time")
         return usual(loop, coupling, *more, **options)
 
     monkeypatch.setattr("haptic_loop.design.optimal.prove", refusing)
     loop = loop_of("n3")
-    found = design(loop, SMALLEST if refused == 1 else SHORT)
-    assert all(basis.taken for basis in found.bases)
-    assert found.proved
-    assert len(asked) == refused + 1
-    assert found.coupling is asked[-1]
-    first = asked[0]
+    optimum = design(loop, SMALLEST if refused == 1 else SHORT)
+    assert all(basis.taken for basis in optimum.bases)
+    assert optimum.proved
+    assert len(couplings) == refused + 1
+    assert optimum.coupling is couplings[-1]
+    first = couplings[0]
     if refused == 1:
-        assert 0.99 < found.coupling.g / first.g < 1
+        assert 0.99 < optimum.coupling.g / first.g < 1
     else:
-        np.testing.assert_array_equal(found.coupling.R, smallest("n3").coupling.R)
-    assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
+        np.testing.assert_array_equal(optimum.coupling.R, smallest("n3").coupling.R)
+    assert verify(Stored.of(loop, optimum.coupling, optimum.certificate)).proved
 
 
 @pytest.mark.slow
@@ -286,12 +286,12 @@ def test_sixteen_samples_beside_slow_poles_are_proved():
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
-    found = design(loop, SMALLEST)
-    assert isinstance(found.coupling, ForceFilter)
-    assert found.proved
+    optimum = design(loop, SMALLEST)
+    assert isinstance(optimum.coupling, ForceFilter)
+    assert optimum.proved
     bare = this_environment(force(loop, NoCoupling()), loop.delta).ratio
-    assert found.g >= (1 - MARGIN) / bare
-    assert found.figures.rms_mismatch_db < -2.9
+    assert optimum.g >= (1 - MARGIN) / bare
+    assert optimum.figures.rms_mismatch_db < -2.9
 
 
 def random_loop(seed: int) -> Loop:
@@ -317,10 +317,10 @@ def random_loop(seed: int) -> Loop:
 @pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.validate) for n in (0, *range(2, 12)))])
 def test_random_loops_get_a_proved_design(seed):
     loop = random_loop(seed)
-    found = design(loop, SMALLEST)
-    assert found.proved
-    assert this_environment(force(loop, found.coupling), loop.delta).certified
-    assert found.figures.rms_mismatch < 1.001  # A coupling without force has a mismatch of 1.
+    optimum = design(loop, SMALLEST)
+    assert optimum.proved
+    assert this_environment(force(loop, optimum.coupling), loop.delta).certified
+    assert optimum.figures.rms_mismatch < 1.001  # A coupling without force has a mismatch of 1.
 
 
 def test_designs_keep_small_forces_accurate():
@@ -328,13 +328,13 @@ def test_designs_keep_small_forces_accurate():
 
     The design errs by less than 5 % of this small force.
     """
-    loop, found = loop_of("n0"), best("n0")
+    loop, optimum = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
     together = np.array([1.0, 1.0])
-    asked, error = (np.linalg.norm(G[0] @ together) for G in (ideal, force(loop, found.coupling).at(z) - ideal))
-    assert asked < 0.02 * np.linalg.norm(ideal[0], 2)
-    assert error < 0.05 * asked
+    ideal_force, error = (np.linalg.norm(G[0] @ together) for G in (ideal, force(loop, optimum.coupling).at(z) - ideal))
+    assert ideal_force < 0.02 * np.linalg.norm(ideal[0], 2)
+    assert error < 0.05 * ideal_force
 
 
 # closed forms --------------------------------------------------------------------------------------------------------
@@ -342,14 +342,14 @@ def test_designs_keep_small_forces_accurate():
 
 @pytest.mark.parametrize("theta", [0, 1, 16])
 def test_scaled_walls_need_the_closed_form(theta):
-    """The wall g K needs the damping g K (theta + 1/2) T, and half of a filter needs half of a filter's damping."""
+    """The wall g K needs the damping g K (theta + 1/2) T, and half the filter needs half the damping."""
     loop = wall(3000.0, theta, 1.3)
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
         assert ratio_in(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
-    whole = smallest("n3").coupling
-    half = ForceFilter(whole.poles, whole.pairs, whole.R / 2)
-    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, whole) / 2, rel=1e-6)
+    full = smallest("n3").coupling
+    half = ForceFilter(full.poles, full.pairs, full.R / 2)
+    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, full) / 2, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -362,8 +362,8 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     delta/(2 theta + 1); a designed filter reaches more.
     """
     loop = wall(5000.0, theta, 1.0)
-    found = design(loop, Options(bases=((4, 3), (8, 6), (14, 10))))
-    stiffness = found.g * 5000 * loop.T / 2
+    optimum = design(loop, Options(bases=((4, 3), (8, 6), (14, 10))))
+    stiffness = optimum.g * 5000 * loop.T / 2
     assert 1.05 / (2 * theta + 1) < stiffness < 1 / (theta + 1)
 
 
@@ -373,12 +373,12 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
 def test_switching_delays_match_a_separate_formula():
     """For some alpha [[He F/(z-1) + delta/T - alpha/2, G*], [G, 2 alpha]] > 0 with F = (z^-4 + z^-6)/2 G."""
     loop = loop_of("n3")
-    found = design(loop.switching(DelayRange((4,), (6,))), SMALLEST)
-    assert found.proved
-    assert found.certificate.facts == ("switching",)
-    assert found.certificate.margin > 1
+    optimum = design(loop.switching(DelayRange((4,), (6,))), SMALLEST)
+    assert optimum.proved
+    assert optimum.certificate.facts == ("switching",)
+    assert optimum.certificate.margin > 1
     z = on_circle(dense())
-    G = loop.sent(found.coupling).at(z)[:, 0, 0]
+    G = loop.sent(optimum.coupling).at(z)[:, 0, 0]
     step = (z**-4 + z**-6) / 2 * G / (z - 1)
 
     def short(alpha: float) -> float:
@@ -387,7 +387,7 @@ def test_switching_delays_match_a_separate_formula():
 
     assert minimize_scalar(short, bounds=(1e-6, 2 * loop.delta[0] / loop.T), method="bounded").fun < 0
     plain = best("n3").figures.rms_mismatch
-    assert plain < found.figures.rms_mismatch < 1
+    assert plain < optimum.figures.rms_mismatch < 1
 
 
 @pytest.mark.slow
@@ -403,7 +403,7 @@ def test_designs_keep_their_objective_and_their_cap():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("further", "asked"),
+    ("further", "changes"),
     [
         ({"high_gain": 1.2, "limiter": True}, {"T_max": 0.0015}),
         ({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}),
@@ -412,13 +412,13 @@ def test_designs_keep_their_objective_and_their_cap():
         pytest.param({"objective": "sup"}, {"varying_delay": DelayRange((4,), (6,))}, marks=pytest.mark.validate),
     ],
 )
-def test_several_demands_can_be_combined(further, asked):
+def test_several_demands_can_be_combined(further, changes):
     """Each demand has separate unknowns in the program, so several demands can be combined."""
-    loop = msgspec.structs.replace(loop_of("n3"), **asked)
-    found = design(loop, replace(SMALLEST, **further))
-    assert found.proved
-    assert found.figures.high_frequency_gain <= further.get("high_gain", np.inf) + 1e-6
-    assert bool(found.certificate.limiter) == further.get("limiter", False)
+    loop = msgspec.structs.replace(loop_of("n3"), **changes)
+    optimum = design(loop, replace(SMALLEST, **further))
+    assert optimum.proved
+    assert optimum.figures.high_frequency_gain <= further.get("high_gain", np.inf) + 1e-6
+    assert bool(optimum.certificate.limiter) == further.get("limiter", False)
 
 
 @pytest.mark.validate
@@ -428,9 +428,9 @@ def test_ranges_fall_back_to_a_proved_basis():
     network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
     loop = Loop(1e-3, (2,), (0,), (2,), (1.0,), network)
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    found = design(ranged, replace(SMALLEST, seconds=5.0))
-    assert found.proved
-    assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment, only scaled down, reaches -3.05 dB
+    optimum = design(ranged, replace(SMALLEST, seconds=5.0))
+    assert optimum.proved
+    assert optimum.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment, only scaled down, reaches -3.05 dB
 
 
 @pytest.mark.validate
@@ -439,15 +439,15 @@ def test_range_couplings_are_proved_at_every_vertex():
     nominal = smallest("n3")
     assert not robustness(loop, nominal.coupling).certified
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    found = design(ranged, SMALLEST)
-    assert found.proved
-    assert len(found.certificate.matrices) == len(ranged.members())
-    assert found.certificate.guarantee == "these ranges"
-    spread = robustness(loop, found.coupling)
+    optimum = design(ranged, SMALLEST)
+    assert optimum.proved
+    assert len(optimum.certificate.matrices) == len(ranged.members())
+    assert optimum.certificate.guarantee == "these ranges"
+    spread = robustness(loop, optimum.coupling)
     assert spread.certified
     for network in vertices(loop.environment).values():
-        assert this_environment(loop.at(network).F(found.coupling), loop.delta).certified
-    assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
+        assert this_environment(loop.at(network).F(optimum.coupling), loop.delta).certified
+    assert nominal.figures.rms_mismatch < optimum.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
 def test_each_of_parallel_springs_is_changed_alone():
@@ -487,9 +487,9 @@ def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
 @pytest.mark.slow
 def test_fewer_delay_constraints_weaken_the_bound(monkeypatch):
     loop = loop_of("n3")
-    whole = short_bound(loop).rms
+    usual = short_bound(loop).rms
     monkeypatch.setattr("haptic_loop.design.budgets.BOUND_SUMS", 2)
-    assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
+    assert 0 < bound(loop, knots=8).rms < usual < best("n3").figures.rms_mismatch
 
 
 @pytest.mark.slow
@@ -514,10 +514,10 @@ def test_rms_mismatch_is_at_most_the_scaled_supremum():
 @pytest.mark.slow
 def test_the_rms_bound_bounds_the_supremum(monkeypatch):
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
-    found = BoundBeside.of(loop_of("n3"), best("n3"), -5.0, (0.5, 80.0), replace(SHORT, objective="sup"))
-    assert found.gap_db is None
-    assert found.relative_mismatch_db == found.rms_mismatch_db
-    assert "nor than" in found.words
+    beside = BoundBeside.of(loop_of("n3"), best("n3"), -5.0, (0.5, 80.0), replace(SHORT, objective="sup"))
+    assert beside.gap_db is None
+    assert beside.relative_mismatch_db == beside.rms_mismatch_db
+    assert "nor than" in beside.words
 
 
 def test_invalid_options_and_walls_are_refused():
@@ -603,11 +603,11 @@ def test_entrywise_program_equals_dense_for_three_devices(monkeypatch):
     loop = loop_of("n5")
     case = program.Case(loop, loop.E(), (program.this_environment(loop),))
     problem = Problem(span_of(loop.E(), 3, 2), (case,), Options(), 0.05)
-    found = [problem.solve(problem.start(0.3))]
+    solutions = [problem.solve(problem.start(0.3))]
     monkeypatch.setattr(Problem, "_entries", False)
-    found.append(problem.solve(problem.start(0.3)))
+    solutions.append(problem.solve(problem.start(0.3)))
     A, b, _ = problem.objective()
-    one, other = (np.linalg.norm(A @ x - b) for x in found)
+    one, other = (np.linalg.norm(A @ x - b) for x in solutions)
     assert one == pytest.approx(other, rel=0.005)
 
 
@@ -626,7 +626,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
     span = span_of(E, 4, 3)
-    found = design(loop, SMALLEST)
+    optimum = design(loop, SMALLEST)
     many = 400 if m == 1 else 160
     z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
@@ -663,7 +663,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     Q, R = np.linalg.qr(rows @ change)
     value = cp.Problem(cp.Minimize(cp.sum_squares(R @ y - Q.T @ right)), held).solve(solver=cp.CLARABEL)
     value += right @ right - (Q.T @ right) @ (Q.T @ right)
-    merit = found.figures.rms_mismatch**2 + (static_weight(loop) * (found.g - 1)) ** 2
+    merit = optimum.figures.rms_mismatch**2 + (static_weight(loop) * (optimum.g - 1)) ** 2
     assert -0.005 < 10 * np.log10(merit / value) < 0.1
 
 
@@ -762,19 +762,19 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys, br
     options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "3600"]
     options += ["--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
-    found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]
-    assert found["rendered_stiffness"] > 0.5
-    assert not found["ended_by_seconds"]
+    outcome, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert outcome["bound"]["rms_mismatch_db"] < outcome["assessment"]["transparency"]["rms_mismatch_db"]
+    assert outcome["rendered_stiffness"] > 0.5
+    assert not outcome["ended_by_seconds"]
     assert "ended by --seconds" not in text
-    assert found["robustness"]["required_over_available"] > 1
-    assert found["bases"][-1]["mismatch_db"] <= found["bases"][0]["mismatch_db"]
-    assert f"{found['bound']['rms_mismatch_db']:.2f} dB" in text
+    assert outcome["robustness"]["required_over_available"] > 1
+    assert outcome["bases"][-1]["mismatch_db"] <= outcome["bases"][0]["mismatch_db"]
+    assert f"{outcome['bound']['rms_mismatch_db']:.2f} dB" in text
     assert verify(load_file(tmp_path / "c.json")).proved
     options = ["--coupling", str(tmp_path / "c.json"), "--scenario", str(scenario), "--no-plot", "--out", str(tmp_path)]
     assert compare_main(options) == 0
     compared = json.loads((tmp_path / "report.json").read_text())["couplings"][0]
-    assert compared["robustness"] == found["robustness"]
+    assert compared["robustness"] == outcome["robustness"]
 
 
 @pytest.mark.slow
@@ -800,11 +800,11 @@ def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch,
 def test_a_longer_period_acts_like_smaller_damping():
     """Periods up to T_max act like the damping times T/T_max: a design reaches the same mismatch with either."""
     loop = msgspec.structs.replace(loop_of("n3"), T_max=0.0012)
-    found = design(loop, SMALLEST)
-    assert found.proved
-    assert this_environment(force(loop, found.coupling), loop.delta).ratio == pytest.approx(0.998 / 1.2, rel=2e-3)
+    optimum = design(loop, SMALLEST)
+    assert optimum.proved
+    assert this_environment(force(loop, optimum.coupling), loop.delta).ratio == pytest.approx(0.998 / 1.2, rel=2e-3)
     less = msgspec.structs.replace(loop_of("n3"), delta=tuple(d / 1.2 for d in loop.delta))
-    assert found.figures.rms_mismatch_db == pytest.approx(design(less, SMALLEST).figures.rms_mismatch_db, abs=0.02)
+    assert optimum.figures.rms_mismatch_db == pytest.approx(design(less, SMALLEST).figures.rms_mismatch_db, abs=0.02)
 
 
 def test_late_walls_match_their_closed_form():
@@ -813,9 +813,9 @@ def test_late_walls_match_their_closed_form():
     K = 1000 * delta / 0.841354  # with any latency in [0, t2] this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
     assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
-    found = design(loop, SMALLEST)
-    assert found.proved
-    assert found.g >= 0.49
+    optimum = design(loop, SMALLEST)
+    assert optimum.proved
+    assert optimum.g >= 0.49
 
 
 @pytest.mark.slow
@@ -825,13 +825,13 @@ def test_late_walls_match_their_closed_form():
 def test_limiter_designs_satisfy_the_limiters_block(name):
     """With D = Delta/T, He[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] > 0 on a grid."""
     loop = loop_of(name)
-    found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
-    assert found.proved
-    proof = found.certificate.limiter
-    assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
+    optimum, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
+    assert optimum.proved
+    proof = optimum.certificate.limiter
+    assert verify(Stored.of(loop, optimum.coupling, optimum.certificate)).proved
     D, rho, m = np.diag(loop.delta) / loop.T, np.diag(proof.multipliers["rho"]), loop.channels
     z = on_circle(dense()[::8])
-    G = loop.sent(found.coupling).at(z)
+    G = loop.sent(optimum.coupling).at(z)
     for k, x in enumerate(z):
         theta = np.diag([x**-t for t in loop.theta])
         c = proof.multipliers["c"]
@@ -840,8 +840,8 @@ def test_limiter_designs_satisfy_the_limiters_block(name):
         late = rho @ theta / x
         block = np.block([[theta @ G[k] / (x - 1) + D, -late], [N @ G[k] + 2 * D, D - late + rho @ M / x]])
         assert np.linalg.eigvalsh(block + block.conj().T)[0] > 0
-    assert found.figures.rms_mismatch_db < without.figures.rms_mismatch_db + 2.5
-    assert without.figures.rms_mismatch_db < found.figures.rms_mismatch_db + 0.05
+    assert optimum.figures.rms_mismatch_db < without.figures.rms_mismatch_db + 2.5
+    assert without.figures.rms_mismatch_db < optimum.figures.rms_mismatch_db + 0.05
     assert m == len(proof.multipliers["c"])
 
 
@@ -856,7 +856,7 @@ def test_limited_forces_are_not_designed_for_ranges():
 @pytest.mark.parametrize("seed", [11, *(pytest.param(n, marks=pytest.mark.validate) for n in (12, 14))])
 def test_extreme_loops_get_a_proved_design(seed):
     """The loops are extreme: 15 samples of delay, 54 kg, springs of 0.03 N/m, dampings of 0.04 N s/m."""
-    found = design(hostile(np.random.default_rng(seed)), SMALLEST)
-    assert found.proved
-    assert isinstance(found.coupling, ForceFilter)
-    assert found.bases[0].certified
+    optimum = design(hostile(np.random.default_rng(seed)), SMALLEST)
+    assert optimum.proved
+    assert isinstance(optimum.coupling, ForceFilter)
+    assert optimum.bases[0].certified

@@ -59,8 +59,8 @@ class Contradicting(Scaled):
 
 @pytest.mark.parametrize("coupling", [SOFT, SpringDamper([20000.0] * 2, [0.0] * 2)])
 def test_a_multiplier_without_entries_is_swept(coupling):
-    asked, here = (required_damping(PAIR, coupling, each) for each in (PerWall(), "this-environment"))
-    assert asked.ratio == pytest.approx(here.ratio, rel=1e-9)
+    own, here = (required_damping(PAIR, coupling, each) for each in (PerWall(), "this-environment"))
+    assert own.ratio == pytest.approx(here.ratio, rel=1e-9)
     assert required_damping(PAIR, coupling, LimitedForces(0.01, 0)).ratio >= here.ratio - 1e-9
 
 
@@ -71,10 +71,10 @@ def test_proofs_with_empty_multipliers_are_verified():
 
 def test_conditions_that_exact_arithmetic_contradicts_are_not_certified():
     assert required_damping(PAIR, STIFF, Contradicting()).certified
-    found = requirements_of(PAIR, STIFF, own=Contradicting())["contradicting"]
-    assert not found.certified
-    assert "violated at" in (found.reason or "")
-    assert found.required == (np.inf, np.inf)
+    requirement = requirements_of(PAIR, STIFF, own=Contradicting())["contradicting"]
+    assert not requirement.certified
+    assert "violated at" in (requirement.reason or "")
+    assert requirement.required == (np.inf, np.inf)
 
 
 def test_check_does_not_replace_the_proof_on_file(tmp_path, capsys):

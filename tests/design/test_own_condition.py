@@ -69,9 +69,9 @@ def _beyond() -> dict[str, tuple]:
 @pytest.mark.parametrize("name", BEYOND)
 def test_a_condition_covers_only_what_it_names(name):
     loop, coupling = _beyond()[name]
-    found = required_damping(loop, coupling, Plain())
-    assert np.isinf(found.ratio)
-    assert f"{name}, which the condition plain" in str(found.reason)
+    requirement = required_damping(loop, coupling, Plain())
+    assert np.isinf(requirement.ratio)
+    assert f"{name}, which the condition plain" in str(requirement.reason)
     with pytest.raises(NotProved, match=f"the loop has {name}, which the condition plain does not name"):
         prove(loop, coupling, Plain())
 
@@ -112,9 +112,9 @@ def test_named_ranges_are_proved_at_every_vertex():
 @pytest.mark.parametrize("taken", ["any-environment", "this-environment", "limiter", "", 7])
 def test_shipped_or_invalid_condition_names_are_refused(taken):
     own = type("Steal", (Plain,), {"name": taken})()
-    for asked in (lambda: required_damping(PAIR, SOFT, own), lambda: prove(PAIR, SOFT, own)):
+    for call in (lambda: required_damping(PAIR, SOFT, own), lambda: prove(PAIR, SOFT, own)):
         with pytest.raises(ValueError, match="condition Steal: its name is"):
-            asked()
+            call()
     ours = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "this-environment"))
     if taken == "this-environment":
         assert "condition Steal: its name is" in str(verify(ours, own).reason)
@@ -146,11 +146,11 @@ class Shifting(SwitchingDelays):
 
 def test_own_multipliers_are_searched_stored_and_checked():
     loop, own = PAIR.switching(DelayRange(PAIR.theta, tuple(n + 1 for n in PAIR.theta))), Shifting()
-    found, shipped = required_damping(loop, SOFT, own), required_damping(loop, SOFT, SWITCHING)
-    assert found.required == shipped.required
-    assert found.bound == pytest.approx(found.ratio, rel=1e-6)
+    requirement, shipped = required_damping(loop, SOFT, own), required_damping(loop, SOFT, SWITCHING)
+    assert requirement.required == shipped.required
+    assert requirement.bound == pytest.approx(requirement.ratio, rel=1e-6)
     stored = Stored.of(loop, SOFT, prove(loop, SOFT, own))
-    assert stored.certificate.multipliers == {"alpha": found.multiplier}
+    assert stored.certificate.multipliers == {"alpha": requirement.multiplier}
     assert verify(stored, own).proved
     for other in ({}, {"alpha": (1.0, 1.0)}, {"alpha": (-1.0, 1.0)}):
         forged = change(stored.certificate, multipliers=other)
@@ -175,7 +175,7 @@ def test_facts_and_conditions_need_one_method_each():
 def test_an_own_fact_matches_a_dense_sweep(repeats):
     """The ratio s is the least with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid; 8 other a have no less."""
     own = repeats["RepeatedForces"]()
-    found = required_damping(PAIR, SOFT, own)
+    requirement = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     G, per_damping = F.at(z), np.sqrt(PAIR.T / np.array(PAIR.delta))
 
@@ -185,11 +185,11 @@ def test_an_own_fact_matches_a_dense_sweep(repeats):
         here = here + np.conj(np.swapaxes(G, 1, 2)) @ np.diag(1 / (2 * a)) @ G
         return np.linalg.eigvalsh(per_damping[:, None] * here * per_damping).max()
 
-    best = np.array(found.multiplier)
-    assert found.ratio == pytest.approx(dense(best), rel=1e-6)
-    assert found.ratio > required_damping(PAIR, SOFT, "this-environment").ratio
+    best = np.array(requirement.multiplier)
+    assert requirement.ratio == pytest.approx(dense(best), rel=1e-6)
+    assert requirement.ratio > required_damping(PAIR, SOFT, "this-environment").ratio
     others = np.random.default_rng(0).uniform(0.5, 2.0, (8, 2)) * best
-    assert min(dense(a) for a in others) > found.ratio * (1 - 1e-6)
+    assert min(dense(a) for a in others) > requirement.ratio * (1 - 1e-6)
 
 
 @pytest.mark.slow
@@ -235,23 +235,23 @@ def test_own_conditions_state_environments_and_limits():
 
 @dataclass(frozen=True)
 class Mean(Coupling):
-    """A spring after a weighted mean of two samples; `kept` softens its form, and `told` its compliance."""
+    """A spring after a weighted mean of two samples. `in_form` and `in_compliance` soften what these methods return."""
 
     K: float
-    kept: float = 1.0
-    told: float = 1.0
+    in_form: float = 1.0
+    in_compliance: float = 1.0
 
     def _V(self, T, times=1.0):
         return Lti.diag(*[taps(numbers([0.8, 0.2], T) * numbers(times / self.K, T), T)] * 2)
 
     def compliance(self, T):
-        return self._V(T, self.told)
+        return self._V(T, self.in_compliance)
 
     def around(self, environment, further=0):
         return environment.feedback(as_like(environment, self._V(environment.T)))
 
     def form(self):
-        return Compliance(self._V(PAIR.T, self.kept)).form()
+        return Compliance(self._V(PAIR.T, self.in_form)).form()
 
 
 def test_a_coupling_must_equal_its_stored_form():
@@ -259,7 +259,7 @@ def test_a_coupling_must_equal_its_stored_form():
     assert filed(PAIR, SOFT) is SOFT
     certificate = prove(PAIR, Mean(400.0), "this-environment")
     assert verify(Stored.of(PAIR, Mean(400.0), certificate)).proved
-    for other, what in ((Mean(400.0, kept=1.00001), "around"), (Mean(400.0, told=2.0), "compliance")):
-        for asked in (Stored.of, filed, lambda loop, given: prove(loop, given, "this-environment")):
+    for other, what in ((Mean(400.0, in_form=1.00001), "around"), (Mean(400.0, in_compliance=2.0), "compliance")):
+        for call in (Stored.of, filed, lambda loop, coupling: prove(loop, coupling, "this-environment")):
             with pytest.raises(InputError, match=f"coupling Mean: form.*another system than {what}"):
-                asked(PAIR, other)
+                call(PAIR, other)

@@ -60,10 +60,12 @@ def test_the_longest_period_scales_switching_and_multipliers():
     )
     delayed = change(LOOP, psi=(1, 0), environment=soft)
     longer = change(delayed, T_max=LONG, delta=tuple(1.6 * d for d in LOOP.delta))
-    found = design(delayed)
-    asked = [required_damping(one, found.coupling, "any-environment", found.phi) for one in (delayed, longer)]
-    assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
-    assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "any-environment", found.phi))).proved
+    optimum = design(delayed)
+    needs = [required_damping(one, optimum.coupling, "any-environment", optimum.phi) for one in (delayed, longer)]
+    assert needs[1].ratio == pytest.approx(needs[0].ratio, rel=1e-7)
+    assert verify(
+        Stored.of(longer, optimum.coupling, prove(longer, optimum.coupling, "any-environment", optimum.phi))
+    ).proved
 
 
 def test_the_longest_period_scales_limited_forces():
@@ -108,8 +110,8 @@ def test_uneven_period_certificates_are_proved_from_files(condition):
 
 def test_uneven_period_designs_are_certified():
     loop = change(LOOP, T_max=LONG)
-    found = design(loop, "this-environment")
-    requirement = requirements_of(loop, found.coupling)["this-environment"]
+    optimum = design(loop, "this-environment")
+    requirement = requirements_of(loop, optimum.coupling)["this-environment"]
     assert requirement.certified
     assert requirement.proof == "rational"
     assert requirement.ratio == pytest.approx(1, rel=1e-3)  # the design uses all available damping

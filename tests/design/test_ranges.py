@@ -83,11 +83,11 @@ def test_vertices_are_range_ends_and_absences():
     )
     nominal, *vertices = members(FIGURE_4, ranges)
     assert nominal.network == FIGURE_4
-    found = {(v.network.springs[0], v.network.springs[1], v.network.masses["mass"]) for v in vertices}
+    values = {(v.network.springs[0], v.network.springs[1], v.network.masses["mass"]) for v in vertices}
     first = [Spring(("contact 1", "mass"), k, b) for k, b in [*product((640, 960), (0.5, 1)), (0, 0)]]
     second = [Spring(("mass", "contact 2"), k, 1.0) for k in (560, 840)]
-    assert found == set(product(first, second, (0.5, 2.0)))
-    assert len(vertices) == len(found) == 20
+    assert values == set(product(first, second, (0.5, 2.0)))
+    assert len(vertices) == len(values) == 20
     assert vertices[-1].name == "vertex 20 (contact 1-mass absent; mass-contact 2 840 N/m, 1 N s/m; mass 2 kg)"
 
 
@@ -121,7 +121,7 @@ def test_samples_lie_inside_and_extend_shorter_draws():
 
 
 def chain(links: int) -> tuple[Network, Ranges]:
-    """Build springs in a row with ranges of 50 to 200 N/m."""
+    """Return springs in a row, and their ranges of 50 to 200 N/m."""
     nodes = [f"n{i}" for i in range(links + 1)]
     springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
     ranges = Ranges(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs))
@@ -141,7 +141,7 @@ def test_any_three_parameters_take_all_end_combinations(links):
 
 
 def absences(links: int) -> tuple[Network, Ranges]:
-    """Build springs in a row with ranges of 50 to 200 N/m, each of which may be absent."""
+    """Return springs in a row, and their ranges of 50 to 200 N/m; each spring may be absent."""
     network, ranges = chain(links)
     return network, Ranges(tuple(msgspec.structs.replace(spring, absent=True) for spring in ranges.springs))
 
@@ -267,19 +267,18 @@ def test_an_absent_environment_needs_no_damping():
     """At the vertex without either spring the object exerts no force, so no damping is required."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in LOOP.network.springs))
     loop = change(LOOP, ranges=both)
-    found = optimal.design(loop, SMALLEST)
-    check = check_ranges(loop, found.coupling, samples=4)
+    design = optimal.design(loop, SMALLEST)
+    check = check_ranges(loop, design.coupling, samples=4)
     assert check.proved
-    nothing = check.at_members[[m.name for m in check.members].index(check.members[-1].name)]
-    assert nothing.ratio == 0
+    assert check.at_members[-1].ratio == 0
 
 
 @pytest.mark.validate
 def test_wide_ranges_have_a_proved_design():
     ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
-    found = optimal.design(change(LOOP, ranges=ranges), SMALLEST)
-    assert found.proved
-    assert found.certificate.guarantee == "these ranges"
+    design = optimal.design(change(LOOP, ranges=ranges), SMALLEST)
+    assert design.proved
+    assert design.certificate.guarantee == "these ranges"
 
 
 # the proof
@@ -357,12 +356,12 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     common = ["--scenario", str(scenario_file), "--json", str(report)]
 
-    def told(main, *options) -> tuple[int, dict]:
+    def reported(main, *options) -> tuple[int, dict]:
         code = main([*options])
         capsys.readouterr()
         return code, json.loads(report.read_text())
 
-    code, design = told(design_main, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common)
+    code, design = reported(design_main, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common)
     assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (
         0,
         "these ranges",
@@ -375,7 +374,7 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == "these ranges"
 
-    code, checked = told(check_main, str(file), "--json", str(report))
+    code, checked = reported(check_main, str(file), "--json", str(report))
     assert (code, checked["guarantee"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
@@ -390,7 +389,7 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
         "0.2",
         "--no-plot",
     ]
-    code, run = told(run_main, *at_vertex, *out)
+    code, run = reported(run_main, *at_vertex, *out)
     assert (code, safe_with(run)) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert not np.load(tmp_path / "out" / "trace.npz")["f"].any()  # The device touches nothing at this vertex.
@@ -402,16 +401,16 @@ def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path, c
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     out = ["--scenario", str(scenario_file), "--json", str(report), "--out", str(tmp_path / "out")]
 
-    def told(main, *options) -> tuple[int, dict]:
+    def reported(main, *options) -> tuple[int, dict]:
         code = main([*options])
         capsys.readouterr()
         return code, json.loads(report.read_text())
 
-    code, audit = told(audit_main, "--coupling", str(file), *out)
+    code, audit = reported(audit_main, "--coupling", str(file), *out)
     assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, "these ranges", True)
 
     quick = ["--humans", "6", "--engine", "exact", "--duration", "0", "--no-plot"]
-    code, validated = told(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
+    code, validated = reported(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
     assert (code, validated["certified"], validated["environments"]["count"]) == (0, True, 8)
     assert validated["unstable"]["exact"] == 0
     assert validated["worst"]["environment"] in validated["environments"]["names"]
@@ -429,14 +428,14 @@ def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
 
 @pytest.mark.slow
 def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp_path, capsys):
-    asked = ["--condition", "this-environment", "--scenario", str(scenario_file)]
-    assert design_main([*asked, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 0
+    options = ["--condition", "this-environment", "--scenario", str(scenario_file)]
+    assert design_main([*options, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 0
     assert safe_with(json.loads(capsys.readouterr().out)) == "these ranges"
-    made = load(tmp_path / "s.json")
-    assert verify(made).proved
-    V = 1 / (np.array(made.coupling.K) + np.array(made.coupling.B) * (1 - 1 / Z)[:, None] / T)
+    stored = load(tmp_path / "s.json")
+    assert verify(stored).proved
+    V = 1 / (np.array(stored.coupling.K) + np.array(stored.coupling.B) * (1 - 1 / Z)[:, None] / T)
     shares = []
-    for member in made.loop.members():
+    for member in stored.loop.members():
         E = environment_by_hand(member.network, Z)
         F = Z**-2 * E[:, 0, 0] / (1 + E[:, 0, 0] * V[:, 0])
         shares.append(-(F / (Z - 1)).real.min() / (1.37 / T))

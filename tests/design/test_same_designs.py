@@ -36,8 +36,8 @@ def test_a_racing_clock_changes_no_byte(monkeypatch):
     loop = load(LOOPS / "o01-wall-light-device.toml").loop("I")
 
     def stored():
-        made = design(loop, Options(bases=((2, 1), (4, 3))))
-        return len(made.bases), msgspec.json.encode(Stored.of(loop, made.coupling, made.certificate))
+        optimum = design(loop, Options(bases=((2, 1), (4, 3))))
+        return len(optimum.bases), msgspec.json.encode(Stored.of(loop, optimum.coupling, optimum.certificate))
 
     plain = stored()
     with monkeypatch.context() as racing:

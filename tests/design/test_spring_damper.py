@@ -33,7 +33,7 @@ CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))
 
 
-def asked(lam=(1, 2), network=FIGURE_4, theta=(1, 2), psi=(0, 0), delta=DELTA, period=T) -> Loop:
+def pair(lam=(1, 2), network=FIGURE_4, theta=(1, 2), psi=(0, 0), delta=DELTA, period=T) -> Loop:
     return Loop(period, theta, psi, lam, delta, network)
 
 
@@ -45,42 +45,42 @@ def random_starts(count, seed=0):
 @pytest.mark.parametrize(("case", "norm"), [("I", 11.248), ("II", 11.318)])
 @pytest.mark.parametrize("start", [None, *random_starts(2)])
 def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
-    found = design(asked(CASES[case]), starts=() if start is None else [start])
+    optimum = design(pair(CASES[case]), starts=() if start is None else [start])
     # Without the reserve K would be (878.86, 551.94) N/m; the reserve costs 0.01 %.
-    np.testing.assert_allclose(found.coupling.K, np.array([878.86, 551.94]) * (1 - RESERVE), rtol=2e-5)
-    np.testing.assert_allclose(found.coupling.B, [0.3865, 0.5220], rtol=1e-3)
-    assert found.objective == pytest.approx(norm, rel=2e-4)
-    assert found.requirement.ratio == pytest.approx(1 - RESERVE, abs=1e-6)
-    assert found.requirement.certified
+    np.testing.assert_allclose(optimum.coupling.K, np.array([878.86, 551.94]) * (1 - RESERVE), rtol=2e-5)
+    np.testing.assert_allclose(optimum.coupling.B, [0.3865, 0.5220], rtol=1e-3)
+    assert optimum.objective == pytest.approx(norm, rel=2e-4)
+    assert optimum.requirement.ratio == pytest.approx(1 - RESERVE, abs=1e-6)
+    assert optimum.requirement.certified
 
 
 @pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
 def test_dampers_that_cost_stiffness_are_zero(condition):
     """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness, so B = 0 is best at a stiff wall."""
     wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
-    found = design(asked((0,), wall, (0,), (0,), (0.5,)), condition)
-    assert found.coupling.B[0] == 0.0
-    assert found.requirement.certified
+    optimum = design(pair((0,), wall, (0,), (0,), (0.5,)), condition)
+    assert optimum.coupling.B[0] == 0.0
+    assert optimum.requirement.certified
 
 
 def test_the_objective_is_the_returned_norm():
-    loop = asked()
-    found = design(loop)
-    V = found.coupling.compliance(T)
+    loop = pair()
+    optimum = design(loop)
+    V = optimum.coupling.compliance(T)
     z = np.exp(1j * np.linspace(0.0455, 0.0475, 4001))  # the resonance at 6.17 Hz
     E = loop.E().at(z)
     L = np.eye(2) + E @ V.at(z) - (delay((1, 2), T).at(z) @ np.linalg.inv(delay((1, 2), T).at(z)))
     a = 2 * np.pi * 80 * T
     w = a / (a + 1 - 1 / z)
     by_hand = (np.abs(w) * np.linalg.norm(L, 2, axis=(1, 2))).max()
-    assert found.objective == pytest.approx(by_hand, rel=1e-5)
+    assert optimum.objective == pytest.approx(by_hand, rel=1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draws", [60, pytest.param(200, marks=pytest.mark.validate)])
 @pytest.mark.parametrize("case", [pytest.param("I", marks=pytest.mark.validate), "II"])
 def test_no_certified_gains_do_better(case, draws):
-    loop = asked(CASES[case])
+    loop = pair(CASES[case])
     best = design(loop)
     shaping = Shaping(loop)
     rng = np.random.default_rng(5)
@@ -96,7 +96,7 @@ def test_no_certified_gains_do_better(case, draws):
 
 def test_a_handful_of_convex_problems_suffices():
     """The design solves at most four problems. tests/benchmarks/test_design_cost.py measures the seconds."""
-    assert design(asked()).sdps <= 4
+    assert design(pair()).sdps <= 4
 
 
 def stiffest(loop):
@@ -115,10 +115,10 @@ def stiffest_at(B, theta, delta, T):
 
 @pytest.mark.parametrize(("theta", "K"), list(enumerate([2283.0, 878.86, 551.94, 405.1, 320.8])))
 def test_each_delay_allows_its_known_stiffness(theta, K):
-    found = stiffest(asked((0,), WALL, (theta,), (0,), (1.37,)))
-    assert pytest.approx(K * (1 - RESERVE), rel=2e-4) == found.K
+    gains = stiffest(pair((0,), WALL, (theta,), (0,), (1.37,)))
+    assert pytest.approx(K * (1 - RESERVE), rel=2e-4) == gains.K
     # A root search on the condition gives the same K for this B.
-    assert stiffest_at(float(found.B[0]), theta, 1.37, T) == pytest.approx(found.K[0], rel=1e-5)
+    assert stiffest_at(float(gains.B[0]), theta, 1.37, T) == pytest.approx(gains.K[0], rel=1e-5)
 
 
 def test_the_stiffness_scales_with_damping_and_rate():
@@ -153,11 +153,11 @@ def gains_of_least(cost, theta, sigma):
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """One matrix inequality or, for most_stored = 0, many that may fail by `_MISSED` between them agree with cvxpy."""
-    loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
+    loop = pair((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
     certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in ((-1.0, -0.2), (-0.2, -1.0), (-1.0, 1.0)):
-        found = certified.solve(np.array(cost), "a test")
-        assert np.dot(cost, found) == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
+        gains = certified.solve(np.array(cost), "a test")
+        assert np.dot(cost, gains) == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.3])
@@ -175,84 +175,84 @@ def test_the_gain_set_equals_its_block(theta, phi):
         V = SpringDamper([k], [b]).sampled(z, 1.0)
         demand = conditions.any_environment_demand(V, unit, [phi])
         block = hermitian((demand.free + demand.gain).G[0])
-        whole = block[:, 0, 0].real - (np.abs(block[:, 1, 0]) ** 2 / block[:, 1, 1].real if phi else 0)
-        found = k / 2 + b - (np.abs(channel.rows(np.array([k, b])).at(z[0])) ** 2).sum(axis=(1, 2))
-        np.testing.assert_allclose(found, whole / np.abs(V.G[0, :, 0, 0]) ** 2, rtol=1e-8, atol=1e-9)
+        block_value = block[:, 0, 0].real - (np.abs(block[:, 1, 0]) ** 2 / block[:, 1, 1].real if phi else 0)
+        room = k / 2 + b - (np.abs(channel.rows(np.array([k, b])).at(z[0])) ** 2).sum(axis=(1, 2))
+        np.testing.assert_allclose(room, block_value / np.abs(V.G[0, :, 0, 0]) ** 2, rtol=1e-8, atol=1e-9)
 
 
 def test_unlike_channels_are_as_stiff_as_alone():
     springs = tuple(Spring((name, "m"), k, 1.0) for name, k in (("a", 800.0), ("b", 700.0), ("c", 300.0)))
     network = Network(("a", "b", "c"), (*springs, Spring(("m", "ground"), 100.0, 0.1)), {"m": 1.0})
-    loop = asked((0, 3, 1), network, (0, 3, 1), (0, 0, 0), (2.0, 0.8, 1.37), 1e-3)
-    found = design(loop)
+    loop = pair((0, 3, 1), network, (0, 3, 1), (0, 0, 0), (2.0, 0.8, 1.37), 1e-3)
+    optimum = design(loop)
     alone = [
-        stiffest_at(float(b), n, d, 1e-3) for b, n, d in zip(found.coupling.B, loop.theta, loop.delta, strict=True)
+        stiffest_at(float(b), n, d, 1e-3) for b, n, d in zip(optimum.coupling.B, loop.theta, loop.delta, strict=True)
     ]
-    np.testing.assert_allclose(found.coupling.K, alone, rtol=1e-4)
+    np.testing.assert_allclose(optimum.coupling.K, alone, rtol=1e-4)
 
 
 def test_designs_minimise_the_norm_with_their_weight():
     """By the norm with a flat weight, the design for this weight is no worse than that for the default low-pass."""
     flat = Lti.constant(np.eye(2), T)
-    loop = asked((0, 0))
-    found, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
-    assert found.objective <= Shaping(loop, W2=flat).norm(default)[0] * (1 + 1e-5)
-    assert found.requirement.certified
+    loop = pair((0, 0))
+    optimum, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
+    assert optimum.objective <= Shaping(loop, W2=flat).norm(default)[0] * (1 + 1e-5)
+    assert optimum.requirement.certified
 
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0), (0, 2)])
 def test_designs_for_delayed_environments_are_certified(psi):
-    loop = asked((0, 0), SOFT_NETWORK, psi=psi)
-    found = design(loop)
-    V = found.coupling.compliance(T)
-    assert found.requirement.certified
-    assert found.phi.max() < 1.37
+    loop = pair((0, 0), SOFT_NETWORK, psi=psi)
+    optimum = design(loop)
+    V = optimum.coupling.compliance(T)
+    assert optimum.requirement.certified
+    assert optimum.phi.max() < 1.37
     # Two checks that the design does not use: the LMI over every multiplier, and this-environment.
     assert analysis(V, loop.E(), loop.theta, psi, DELTA).feasible
-    assert this_environment(force_map(loop.E(), found.coupling, loop.theta, psi), DELTA).certified
+    assert this_environment(force_map(loop.E(), optimum.coupling, loop.theta, psi), DELTA).certified
 
 
 def test_zero_multiplier_gives_the_plain_condition():
     for gains in random_starts(4, seed=4):
         V = gains.compliance(T)
         plain = any_environment(V, (1, 2), DELTA)
-        same = conditions.any_environment(V, asked(), np.zeros(2))
+        same = conditions.any_environment(V, pair(), np.zeros(2))
         assert same.ratio == pytest.approx(plain.ratio, rel=1e-6)
 
 
 @pytest.mark.parametrize(("case", "rms_db"), [("I", -10.98), ("II", -7.99)])
 def test_this_environment_designs_exceed_any_environments_stiffness(case, rms_db):
-    loop = asked(CASES[case])
-    found = design(loop, "this-environment")
-    assert 20 * np.log10(found.objective) <= rms_db
-    assert found.requirement.condition == "this-environment"
-    assert found.requirement.ratio <= 1 - RESERVE
-    assert found.coupling.K.min() > 2500
-    assert not any_environment(found.coupling.compliance(T), loop.theta, DELTA).certified
+    loop = pair(CASES[case])
+    optimum = design(loop, "this-environment")
+    assert 20 * np.log10(optimum.objective) <= rms_db
+    assert optimum.requirement.condition == "this-environment"
+    assert optimum.requirement.ratio <= 1 - RESERVE
+    assert optimum.coupling.K.min() > 2500
+    assert not any_environment(optimum.coupling.compliance(T), loop.theta, DELTA).certified
 
 
 def test_this_environment_designs_stabilise_delayed_environments():
     """An almost rigid coupling would need more than the available damping."""
     held = Network(("c",), (Spring(("c", "m"), 800.0, 1.0), Spring(("m", "ground"), 700.0, 1.0)), {"m": 1.0})
-    loop = asked((0,), held, (2,), (1,), (2.0,))
-    found = design(loop, "this-environment")
-    assert found.requirement.ratio <= 1 - RESERVE
+    loop = pair((0,), held, (2,), (1,), (2.0,))
+    optimum = design(loop, "this-environment")
+    assert optimum.requirement.ratio <= 1 - RESERVE
     rigid = force_map(loop.E(), SpringDamper([1e6], [0.0]), loop.theta, loop.psi)
     assert this_environment(rigid, loop.delta).ratio > 1
-    assert force_map(loop.E(), found.coupling, loop.theta, loop.psi).is_stable()
+    assert force_map(loop.E(), optimum.coupling, loop.theta, loop.psi).is_stable()
 
 
 @pytest.mark.slow
 def test_failed_searches_claim_no_impossibility():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
-        design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
+        design(pair((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
     assert not isinstance(caught.value, Infeasible)
 
 
 @pytest.mark.validate
 def test_proposed_changes_hold_when_made():
     """Each proposed design is certified by a sweep. The least error comes first, and none is the failed request."""
-    loop = asked((0, 0), psi=(1, 1))
+    loop = pair((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
     proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)
     assert ("optimal", "this-environment") in [(kind, condition) for kind, condition, _ in proposed]
@@ -260,9 +260,9 @@ def test_proposed_changes_hold_when_made():
     errors = [float(error) for _, _, error in proposed]
     assert errors == sorted(errors)
     for kind, condition, error in proposed:
-        made = design_by_kind(loop, kind, condition, **({"bases": ((4, 3), (8, 6))} if kind == "optimal" else {}))
-        assert made.requirement.certified
-        assert decibels(transparency_of(loop, made).rms_mismatch) < float(error) + 0.01
+        proposal = design_by_kind(loop, kind, condition, **({"bases": ((4, 3), (8, 6))} if kind == "optimal" else {}))
+        assert proposal.requirement.certified
+        assert decibels(transparency_of(loop, proposal).rms_mismatch) < float(error) + 0.01
 
 
 REFUSALS = [
@@ -282,7 +282,7 @@ REFUSALS = [
 def test_a_bad_request_gets_one_line(change, message):
     weight = {name: change[name] for name in change if name == "W2"}
     with pytest.raises(ValueError, match=message) as caught:
-        design(asked(**{name: change[name] for name in change if name not in weight}), **weight)
+        design(pair(**{name: change[name] for name in change if name not in weight}), **weight)
     assert "\n" not in str(caught.value)
 
 
@@ -300,14 +300,14 @@ def test_an_active_environment_is_refused():
 
 def test_an_unknown_condition_is_refused():
     with pytest.raises(ValueError, match="condition is 'both', allowed are any-environment, this-environment"):
-        design(asked(), "both")
+        design(pair(), "both")
 
 
 def test_long_delay_designs_pass_a_dense_sweep():
     """With 50 samples of delay (e) of docs/theory.md holds at 40001 frequencies, 1560 per ripple of its left side."""
-    made = stiffest(asked((0,), WALL, (50,), (0,), (1.37,)))
+    gains = stiffest(pair((0,), WALL, (50,), (0,), (1.37,)))
     z, n = np.exp(1j * np.linspace(0, np.pi, 40_001)), 51
-    (K,), (B,) = made.K, made.B
+    (K,), (B,) = gains.K, gains.B
     y = K * T * np.polyval(np.ones(n), 1 / z) + B * (1 - z**-n)
     needed = (np.abs(y) ** 2).max() / (4 * (K * T / 2 + B))
     assert 0.9997 * 1.37 < needed < 1.37
@@ -348,18 +348,18 @@ def test_designs_that_take_minutes_are_refused_early():
 @pytest.mark.slow
 def test_one_start_comes_close_to_all_starts(monkeypatch):
     """Above FEW channels the search has one start. The gains have five digits, which change the objective by 4e-6."""
-    usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective
+    usual = design(pair(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)
     monkeypatch.setattr(gain_search, "FEW", 1)
-    made = design(asked(CASES["I"]), "this-environment", limiter=True)
-    assert made.requirement.certified
-    assert made.objective == pytest.approx(usual, rel=1e-4)
-    assert all(float(f"{gain:.5g}") == gain for gain in (*made.coupling.K, *made.coupling.B))
+    optimum = design(pair(CASES["I"]), "this-environment", limiter=True)
+    assert optimum.requirement.certified
+    assert optimum.objective == pytest.approx(usual, rel=1e-4)
+    assert all(float(f"{gain:.5g}") == gain for gain in (*optimum.coupling.K, *optimum.coupling.B))
 
 
 def test_no_limiter_search_follows_a_failed_linear_search() -> None:
     """Where no coupling is certified for unlimited forces, no search is spent on limited forces."""
-    loop, limited = asked((0,), WALL, (1,), (1,), (1e-3,)), []
+    loop, limited = pair((0,), WALL, (1,), (1,), (1e-3,)), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spring_damper, "LimiterLoop", lambda *args: limited.append(args))
         with pytest.raises(DesignFailed, match="this-environment condition certifies for theta"):

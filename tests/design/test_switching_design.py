@@ -27,7 +27,7 @@ HANDS, SECONDS = 20, 0.7
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def designed(tmp_path_factory):
     """Return (report, coupling) of one run of the design command."""
     out = tmp_path_factory.mktemp("design")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", str(out / "c.json")]
@@ -46,8 +46,8 @@ def growing(loop, hands=HANDS, seconds=SECONDS):
 
 
 @pytest.mark.slow
-def test_the_designed_gains_are_proved_for_any_switching(made):
-    report, coupling = made
+def test_the_designed_gains_are_proved_for_any_switching(designed):
+    report, coupling = designed
     loop = load().loop("I")
     swept = switching_sweep(loop.sent(coupling), *RANGE, loop.delta)
     assert swept.certified
@@ -59,9 +59,9 @@ def test_the_designed_gains_are_proved_for_any_switching(made):
 
 
 @pytest.mark.slow
-def test_no_lossless_human_grows_under_the_worst_switching(made):
+def test_no_lossless_human_grows_under_the_worst_switching(designed):
     """No lossless hand grows under greedy adversarial switching. With 20 % less damping some do."""
-    _, coupling = made
+    _, coupling = designed
     scenario = load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial"))
     placed = [scenario.replace(delta=tuple(share * d for d in scenario.delta)) for share in (1.0, 0.8)]
     assert growing(assemble(placed[0], coupling)) == 0
@@ -106,14 +106,14 @@ def test_any_environment_designs_take_varying_delays(tmp_path):
 )
 def test_optimal_couplings_for_switching_delays_are_proved(basis, most_db):
     """The design is proved and a sweep confirms it. With the larger basis no lossless hand grows at the worst ages."""
-    asked = load().loop("I")
-    made = design_with(asked.switching(DelayRange(*RANGE)), bases=(basis,))
-    assert made.proved
-    swept = switching_sweep(asked.sent(made.coupling), *RANGE, asked.delta)
+    constant = load().loop("I")
+    optimum = design_with(constant.switching(DelayRange(*RANGE)), bases=(basis,))
+    assert optimum.proved
+    swept = switching_sweep(constant.sent(optimum.coupling), *RANGE, constant.delta)
     assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # a margin of 0.2 %; all other damping is used
-    assert 20 * np.log10(made.objective) < most_db
+    assert 20 * np.log10(optimum.objective) < most_db
     if basis == (14, 10):
-        loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
+        loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), optimum.coupling)
         assert growing(loop) == 0
 
 
@@ -137,9 +137,9 @@ def test_optimal_couplings_of_known_devices_take_switching(scenario, basis, most
     m = scenario.channels
     lo, hi = (tuple(each[:m]) for each in RANGE)
     loop = scenario.loop("I").switching(DelayRange(lo, hi))
-    made = design_with(loop, "known-device", bases=(basis,))
-    guarantee = assess(loop, made.coupling, limiter=False, certificate=made.certificate).guarantee
+    optimum = design_with(loop, "known-device", bases=(basis,))
+    guarantee = assess(loop, optimum.coupling, limiter=False, certificate=optimum.certificate).guarantee
     assert (guarantee.condition, guarantee.proof) == ("known-device", "rational")
     assert guarantee.delays == loop.varying_delay
-    assert 20 * np.log10(made.objective) < most_db
-    assert growing(assemble(scenario.replace(varying_delay=VaryingDelay(lo, hi, "adversarial")), made.coupling)) == 0
+    assert 20 * np.log10(optimum.objective) < most_db
+    assert growing(assemble(scenario.replace(varying_delay=VaryingDelay(lo, hi, "adversarial")), optimum.coupling)) == 0

@@ -98,9 +98,9 @@ def test_stored_multipliers_pass_a_dense_sweep(stored):
 def test_other_ranges_are_proved_too(lo, hi):
     soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
     loop = PAIR.switching(DelayRange(lo, hi))
-    made = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
-    assert verify(made).proved
-    assert [a > 0 for a in made.certificate.multipliers["alpha"]] == [a < b for a, b in zip(lo, hi, strict=True)]
+    stored = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
+    assert verify(stored).proved
+    assert [a > 0 for a in stored.certificate.multipliers["alpha"]] == [a < b for a, b in zip(lo, hi, strict=True)]
 
 
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
@@ -175,9 +175,9 @@ def test_facts_must_match_the_range_of_delays(stored):
 def test_negative_multipliers_are_refused():
     """A channel of constant delay has no second row with alpha, so a negative alpha would add damping for free."""
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
-    found = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
+    requirement = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
-        exact_block(loop, STIFF, (found.multiplier[0], -1e6))
+        exact_block(loop, STIFF, (requirement.multiplier[0], -1e6))
 
 
 @pytest.mark.parametrize(
@@ -233,10 +233,13 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
 
 @pytest.mark.validate
 def test_switching_over_ranges_is_guaranteed_for_ranges(ranged):
-    found = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
-    assert found.holds
-    assert (found.guarantee.environments, found.guarantee.facts) == ("these ranges", ("switching", "ranges", "limiter"))
-    assert found.requirements["switching"].ratio < ranged.required[0] / 1.37  # in the nominal environment
+    assessment = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
+    assert assessment.holds
+    assert (assessment.guarantee.environments, assessment.guarantee.facts) == (
+        "these ranges",
+        ("switching", "ranges", "limiter"),
+    )
+    assert assessment.requirements["switching"].ratio < ranged.required[0] / 1.37  # in the nominal environment
     less = change(RANGED, delta=(1.09, 1.09))
     assert required_damping(less, SOFT, "this-environment").ratio > 1
 
@@ -266,7 +269,7 @@ def test_random_members_switch_without_growing_hands(ranged):
 # the commands
 
 
-def told(capsys, main, *options) -> tuple[int, dict]:
+def reported(capsys, main, *options) -> tuple[int, dict]:
     capsys.readouterr()
     code = main([*options, "--json", "-"])
     return code, json.loads(capsys.readouterr().out)
@@ -274,13 +277,13 @@ def told(capsys, main, *options) -> tuple[int, dict]:
 
 @pytest.mark.slow
 def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys):
-    code, report = told(capsys, check_main, file)
+    code, report = reported(capsys, check_main, file)
     assert (code, report["proved"]) == (0, True)
     assert report["switching"]["guarantee"] == f"{WITHIN}, in this environment"
     assert report["switching"]["proof"] == "rational"
     broken = sealed(change(stored.certificate, required=(1.0, 1.0)))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
-    code, report = told(capsys, check_main, str(tmp_path / "broken.json"))
+    code, report = reported(capsys, check_main, str(tmp_path / "broken.json"))
     assert (code, report["proved"]) == (1, False)
     assert report["switching"]["guarantee"] is report["switching"]["proof"] is report["proof"] is None
     assert report["reason"].startswith(f"{WITHIN}: required is")
@@ -291,7 +294,7 @@ def run(tmp_path, capsys):
     quick = ["--engine", "exact", "--duration", "0.1", "--no-plot", "--out", str(tmp_path / "out")]
 
     def report(coupling: str, *options: str) -> dict:
-        code, outcome = told(capsys, run_main, "--coupling", coupling, *options, *quick)
+        code, outcome = reported(capsys, run_main, "--coupling", coupling, *options, *quick)
         assert code == 0
         return outcome
 
@@ -345,9 +348,9 @@ def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
 @pytest.mark.slow
 def test_validate_and_audit_say_what_files_cover(file, constant_file, tmp_path, capsys):
     quick = ["--humans", "3", "--engine", "exact", "--duration", "0", "--no-plot", "--out", str(tmp_path / "v")]
-    _, outcome = told(capsys, validate_main, "--coupling", file, "--varying-delay", "1,2", *quick)
+    _, outcome = reported(capsys, validate_main, "--coupling", file, "--varying-delay", "1,2", *quick)
     assert f"proved in the coupling's file for {WITHIN}" in outcome["switching"]["covers"]
-    code, outcome = told(
+    code, outcome = reported(
         capsys, audit_main, "--coupling", constant_file, "--varying-delay", "1,2", "--out", str(tmp_path)
     )
     assert code == 1
@@ -360,7 +363,7 @@ def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch)
     monkeypatch.setattr(budgets, "PROOF_STATES", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", out]
-    code, outcome = told(capsys, design_main, *options)
+    code, outcome = reported(capsys, design_main, *options)
     assert code == 0
     assert outcome["switching"]["proof"] == "sampled"
     assert outcome["stored"]["proof"] == "rational"
@@ -394,10 +397,10 @@ def test_the_loop_has_the_scenarios_range():
 
 def test_certify_judges_any_switching():
     coupling = built.SpringDamper(SOFT.K, SOFT.B)
-    found = certify(LOOP, coupling)
-    assert found["switching"].certified
-    assert found["switching"].proof == "rational"
-    assert found["this-environment"] == certify(PAIR, coupling)["this-environment"]
+    requirements = certify(LOOP, coupling)
+    assert requirements["switching"].certified
+    assert requirements["switching"].proof == "rational"
+    assert requirements["this-environment"] == certify(PAIR, coupling)["this-environment"]
     assert "switching" not in certify(PAIR, coupling)
 
 
@@ -409,16 +412,16 @@ def test_certify_judges_every_vertex_of_the_ranges(K, certified):
     """The nominal environment alone would certify both couplings."""
     loop = change(PAIR, ranges=Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
-    found, nominal = certify(loop, coupling)["this-environment"], certify(PAIR, coupling)["this-environment"]
+    worst, nominal = certify(loop, coupling)["this-environment"], certify(PAIR, coupling)["this-environment"]
     at = [
         this_environment(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()
     ]
     assert len(at) == 4
-    assert found.ratio == max(requirement.ratio for requirement in at)
+    assert worst.ratio == max(requirement.ratio for requirement in at)
     assert nominal.certified
-    assert found.ratio > nominal.ratio
-    assert found.certified == certified
-    assert found.proof == ("rational" if certified else "sampled")
+    assert worst.ratio > nominal.ratio
+    assert worst.certified == certified
+    assert worst.proof == ("rational" if certified else "sampled")
 
 
 @pytest.mark.slow

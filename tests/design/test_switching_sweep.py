@@ -57,26 +57,28 @@ def test_springs_need_the_damping_of_their_longest_delay(lo, hi):
     The least sum is KT (hi + 1/2), as for the constant delay hi: for a spring, varying delays cost nothing more.
     """
     K = 800.0
-    found = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
-    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # 2 _SETTLED, where the search ends
-    assert found.multiplier[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # the need is flat in alpha
+    requirement = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
+    assert requirement.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # 2 _SETTLED, where the search ends
+    assert requirement.multiplier[0] == pytest.approx(
+        K * (hi - lo) / 2, rel=1e-2, abs=1e-9
+    )  # the need is flat in alpha
 
 
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
 def test_one_delay_gives_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
-    found = switching_sweep(sent(), theta, theta, DELTA)
-    assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
-    assert found.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
+    requirement = switching_sweep(sent(), theta, theta, DELTA)
+    assert requirement.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
+    assert requirement.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
 
 def test_the_least_factor_matches_a_convex_solver():
     """An SDP in (s, alpha) at 13 frequencies, which shares no code with the sweep, has the same least factor."""
     lo, hi = (0, 1), (3, 2)
     G, delta = sent(), np.array([1.37, 0.9])
-    found = switching_sweep(G, lo, hi, delta)
+    requirement = switching_sweep(G, lo, hi, delta)
     per_hz = 2 * np.pi * T
-    near = found.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
+    near = requirement.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
     w = np.concatenate([near, np.geomspace(3e-2, 3, 8)])
     z = np.exp(1j * w)
     s, a = cp.Variable(), cp.Variable(2, nonneg=True)  # alpha and G are in units of 1000 N/m
@@ -87,7 +89,7 @@ def test_the_least_factor_matches_a_convex_solver():
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
     solve(problem)
-    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # the binding frequency is among the samples
+    assert s.value == pytest.approx(requirement.ratio, rel=2e-4)  # the binding frequency is among the samples
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
@@ -99,16 +101,16 @@ def test_the_least_factor_matches_a_convex_solver():
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_gives_the_same_requirement(lo, hi):
     """At 20000 frequencies the condition holds 1e-5 above the requirement, and fails 0.1 % below it."""
-    G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
+    G, requirement = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    alpha, needed, response = np.array(found.multiplier), np.array(found.required), G.at(z)
+    alpha, needed, response = np.array(requirement.multiplier), np.array(requirement.required), G.at(z)
 
     def least(share):
         return np.linalg.eigvalsh(condition(z, response, alpha, lo, hi, share * needed)).min()
 
     assert least(1 + 1e-5) > 0
     assert least(1 - 1e-3) < 0
-    assert found.bound == pytest.approx(found.ratio, rel=1e-5)
+    assert requirement.bound == pytest.approx(requirement.ratio, rel=1e-5)
 
 
 def test_the_energy_bound_holds_for_worst_ages():
@@ -145,9 +147,9 @@ def test_unsafe_or_malformed_switching_is_refused():
         > this_environment(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
     )
     unstable = Lti([[1.1]], [[1.0]], [[1.0]], [[1.0]], T)
-    found = switching_sweep(unstable, [1], [2], [1.0])
-    assert not found.certified
-    assert "pole" in found.reason
+    requirement = switching_sweep(unstable, [1], [2], [1.0])
+    assert not requirement.certified
+    assert "pole" in requirement.reason
     with pytest.raises(ValueError, match="lo <= hi"):
         switching_sweep(sent(), (2, 2), (1, 1), DELTA)
     with pytest.raises(ValueError, match="has 1 entries"):
@@ -156,9 +158,9 @@ def test_unsafe_or_malformed_switching_is_refused():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
 def test_certified_switching_is_proved_exactly(lo, hi):
-    found = judged(loop_of(lo, hi), SOFT, SWITCHING)
-    assert found.certified
-    assert found.proof == "rational"
+    requirement = judged(loop_of(lo, hi), SOFT, SWITCHING)
+    assert requirement.certified
+    assert requirement.proof == "rational"
     part = SwitchingFigures.of(loop_of(lo, hi), SOFT)
     # The two are equal where no delay varies.
     assert part.playout.required_damping[0] <= part.requirement.required[0] * (1 + 1e-9)
@@ -167,17 +169,17 @@ def test_certified_switching_is_proved_exactly(lo, hi):
 
 def test_uncertified_switching_has_no_exact_proof():
     loop = loop_of((1, 1), (2, 2))
-    found = judged(loop, STIFF, SWITCHING)
-    assert not found.certified
-    assert found.proof == "sampled"
+    requirement = judged(loop, STIFF, SWITCHING)
+    assert not requirement.certified
+    assert requirement.proof == "sampled"
     with pytest.raises(NotProved, match=r"needs 2\.041"):
         prove(loop, STIFF, "this-environment")
 
     def storage(loop: Loop):
-        return find_storage(both(SWITCHING.exact_demands(loop, STIFF, found.multiplier)["P"]))
+        return find_storage(both(SWITCHING.exact_demands(loop, STIFF, requirement.multiplier)["P"]))
 
     assert "violated" in storage(loop)[1]
-    required = np.array(found.required)
+    required = np.array(requirement.required)
     more, less = (loop_of((1, 1), (2, 2), tuple((required * f).tolist())) for f in (1 + 1e-4, 1 - 1e-4))
     assert storage(more)[0] is not None
     assert storage(less)[0] is None
@@ -237,12 +239,12 @@ def test_the_multiplier_is_best_in_random_loops():
         gains = SpringDamper(np.exp(rng.uniform(4, 9, channels)), rng.uniform(0, 5, channels))
         G = force_map(environment(star, 1e-3), gains, (0,) * channels, (0,) * channels)
         lo = rng.integers(0, 4, channels)
-        found = switching_sweep(
+        requirement = switching_sweep(
             G, lo.tolist(), (lo + rng.integers(0, 4, channels)).tolist(), rng.uniform(0.1, 5, channels)
         )
         # The search ends within 2 environments._SETTLED = 1e-6 of the bound.
-        assert found.bound <= found.ratio * (1 + 1e-9)
-        assert found.ratio == pytest.approx(found.bound, rel=2e-6)
+        assert requirement.bound <= requirement.ratio * (1 + 1e-9)
+        assert requirement.ratio == pytest.approx(requirement.bound, rel=2e-6)
 
 
 def test_many_devices_use_the_springs_multiplier(monkeypatch):

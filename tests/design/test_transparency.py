@@ -68,9 +68,9 @@ def test_the_integral_resolves_a_sharp_peak():
         return 1 / ((x - 0.3) ** 2 + width**2) + np.exp(x)
 
     closed = (np.arctan(0.7 / width) + np.arctan(0.3 / width)) / width + np.e - 1
-    found = integral(peak, np.linspace(0, 1, 60))
-    assert found == pytest.approx(closed, rel=1e-6)
-    assert found == pytest.approx(quad(peak, 0, 1, points=[0.3], epsrel=1e-10)[0], rel=1e-6)
+    value = integral(peak, np.linspace(0, 1, 60))
+    assert value == pytest.approx(closed, rel=1e-6)
+    assert value == pytest.approx(quad(peak, 0, 1, points=[0.3], epsrel=1e-10)[0], rel=1e-6)
 
 
 def test_the_integral_of_zero_is_zero():
@@ -79,15 +79,15 @@ def test_the_integral_of_zero_is_zero():
 
 def test_integrals_of_rounding_noise_end():
     """Halving intervals gains nothing in noise: the work stays bounded, and the integral is near the noise's mean."""
-    noise, asked = np.random.default_rng(1), []
+    noise, points = np.random.default_rng(1), []
 
     def rounding(x):
-        asked.append(x.size)
+        points.append(x.size)
         return size * noise.random(x.size)
 
     for size in (1e-32, 1e-6, 1.0):
         assert integral(rounding, np.linspace(0, 1, 60)) == pytest.approx(size / 2, rel=0.3)
-    assert sum(asked) < 500_000
+    assert sum(points) < 500_000
 
 
 def test_the_environment_itself_has_no_mismatch():

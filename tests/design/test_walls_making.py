@@ -25,7 +25,7 @@ change = msgspec.structs.replace
 
 
 def held(stiffness, delta=1.3, gap=0.0, theta=1):
-    """Build a loop with a mass of 50 g on 20 N/m and 0.3 N s/m at the tip, and a wall."""
+    """Return a loop with a mass of 50 g on 20 N/m and 0.3 N s/m at the tip, and a wall."""
     wall = Wall(("tip", GROUND), stiffness, gap=gap)
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, (wall,))
     return Loop(1e-3, (theta,), (0,), (theta,), (delta,), network)
@@ -59,7 +59,7 @@ T = 1e-3
 
 
 def bare(stiffness, damping, theta, delta=1.0):
-    """Build a loop with a wall on the device itself."""
+    """Return a loop with a wall on the device itself."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), stiffness, damping),))
     return Loop(T, (theta,), (0,), (theta,), (delta,), network)
 
@@ -77,11 +77,11 @@ def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
     """The requirement equals the figures of a separate computation, and the frozen contact needs no more."""
     for theta, need in enumerate(needs):
         loop = bare(stiffness, damping, theta)
-        found = required_damping(loop, NoCoupling(), "this-environment")
-        assert found.required[0] == pytest.approx(need, rel=5e-5)  # the search's gap to its bound
-        assert found.bound == pytest.approx(found.ratio, rel=5e-5)
+        requirement = required_damping(loop, NoCoupling(), "this-environment")
+        assert requirement.required[0] == pytest.approx(need, rel=5e-5)  # the search's gap to its bound
+        assert requirement.bound == pytest.approx(requirement.ratio, rel=5e-5)
         touching = this_environment(loop.at(loop.environment.frozen()[-1]).F(NoCoupling()), loop.delta)
-        assert touching.required[0] <= found.required[0] * (1 + 1e-9)
+        assert touching.required[0] <= requirement.required[0] * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
 def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
     """A wall of 3000 N/m is behind a coupling of 2000 N/m and 2 N s/m. Forces are delayed by 0, 1 and 2 samples."""
     for theta, need in enumerate(needs):
-        found = required_damping(bare(3000.0, damping, theta), SpringDamper([2000.0], [2.0]), "this-environment")
-        assert found.required[0] == pytest.approx(need, abs=6e-5)
+        requirement = required_damping(bare(3000.0, damping, theta), SpringDamper([2000.0], [2.0]), "this-environment")
+        assert requirement.required[0] == pytest.approx(need, abs=6e-5)
 
 
 def test_without_m_the_requirement_has_closed_forms():
@@ -104,8 +104,8 @@ def test_without_m_the_requirement_has_closed_forms():
     for theta, need in ((0, (k / 2 + b) * T), (1, (k / 2 + b + k**2 / (4 * b)) * T), (2, 7.5)):
         loop = bare(k, damping, theta)
         values = {0: (b, 2 * b, b, 0.0), 1: (b, 2 * b, b, 0.0), 2: (2 * k - 1207.44, 2 * k, b, 0.0)}[theta]
-        found = required_damping(loop, NoCoupling(), "this-environment", values)
-        assert found.required[0] == pytest.approx(need, rel=1e-9)
+        requirement = required_damping(loop, NoCoupling(), "this-environment", values)
+        assert requirement.required[0] == pytest.approx(need, rel=1e-9)
 
 
 def test_the_block_equals_its_definition():
@@ -128,10 +128,10 @@ def test_the_block_equals_its_definition():
             np.diag(c) @ D + np.hstack([np.zeros((3, 2)), np.diag(d), np.diag(d + m * b * (1 - 1 / z))]),
         ]
         order = [0, 1, 2, 5, 3, 4, 7]  # The block orders its inputs by wall: u, then s if it has a damper.
-        whole = np.vstack(rows)[np.ix_(order, order)]
+        expected = np.vstack(rows)[np.ix_(order, order)]
         ours = demand.free.at(z) + s * demand.gain.at(z)
         assert damped == [0, 2]
-        assert (ours + ours.conj().T) == pytest.approx(whole + whole.conj().T, rel=1e-9, abs=1e-6)
+        assert (ours + ours.conj().T) == pytest.approx(expected + expected.conj().T, rel=1e-9, abs=1e-6)
 
 
 def test_vanishing_walls_give_the_plain_condition():
@@ -239,19 +239,19 @@ def test_the_balance_of_z_holds_at_ticks(damped):
     delta, _, block, P, S, m_ = steps_of(damped)
     there, ticks = Walled(loop, BOTH, block), 800
     x = np.cumsum(rng.standard_normal((ticks + 1, 2)) * rng.choice([1e-5, 3e-4], (ticks + 1, 1)), axis=0)
-    seen, pressed, left = [], 0, 0
+    ticked, pressed, left = [], 0, 0
     for k in range(ticks + 1):
         f, _, p = there.step(x[k])
         there.xi = block.A @ there.xi + block.B @ there.v  # The first input is the step from rest.
         X = np.concatenate([x[k], there.h])
         Z = there.xi @ P @ there.xi + X @ S @ X / 2 - (there.k * there.gap * there.h).sum()
         Z -= (m_ * there.b * there.s * there.e).sum()
-        seen.append((x[k], f, Z))
+        ticked.append((x[k], f, Z))
         pressed, left = pressed + (p > 0).any(), left + ((p == 0) & (there.h > 0)).any()
-    start = seen[0][2]
+    start = ticked[0][2]
     assert 50 < pressed < ticks
     assert (left > 0) == damped  # Only with dampers is p = 0 at h > 0.
-    for (x0, f, Z), (x1, _, Z1) in itertools.pairwise(seen):
+    for (x0, f, Z), (x1, _, Z1) in itertools.pairwise(ticked):
         dx = x1 - x0
         size = 1e-9 * (abs(Z) + abs(Z1) + 1e-6)
         assert f @ dx + dx @ (delta / loop.T * dx) >= Z1 - Z - size
@@ -290,9 +290,9 @@ def test_walls_are_proved_stored_and_verified(loop, coupling):
 
 def test_longer_periods_scale_wall_requirements():
     loop, longer = held(3000.0), change(held(3000.0), T_max=1.5e-3)
-    found = required_damping(loop, COUPLING, "this-environment")
-    assert required_damping(longer, COUPLING, "this-environment", found.multiplier).required[0] == pytest.approx(
-        1.5 * found.required[0], rel=1e-6
+    requirement = required_damping(loop, COUPLING, "this-environment")
+    assert required_damping(longer, COUPLING, "this-environment", requirement.multiplier).required[0] == pytest.approx(
+        1.5 * requirement.required[0], rel=1e-6
     )
 
 
@@ -322,7 +322,7 @@ HANDS = 60
 
 
 def pressed_at_rest(damping=0.0):
-    """Build a loop with one wall of 3000 N/m, into which the tip at rest reaches 2 mm."""
+    """Return a loop with one wall of 3000 N/m, into which the tip at rest reaches 2 mm."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, damping, gap=-0.002),))
     return Loop(1e-3, (1,), (0,), (1,), (1.37,), network)
 
@@ -367,11 +367,11 @@ def test_damped_wall_designs_are_tight_and_proved():
     """The design is stiffer than any-environment allows, and softer than all frozen states alone allow (1772 N/m)."""
     wall = Wall(("tip", GROUND), 3000.0, 2.0, 0.005)
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(wall,)))
-    made = design_by_kind(loop, condition="this-environment")
-    assert 0.99 < made.requirement.ratio < 1
-    assert 1500 < made.coupling.K[0] < 1772
-    assert prove(loop, made.coupling, "this-environment").proof == "rational"
-    assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified
+    design = design_by_kind(loop, condition="this-environment")
+    assert 0.99 < design.requirement.ratio < 1
+    assert 1500 < design.coupling.K[0] < 1772
+    assert prove(loop, design.coupling, "this-environment").proof == "rational"
+    assert not any_environment(design.coupling.compliance(loop.T), loop.theta, loop.delta).certified
 
 
 @pytest.mark.slow

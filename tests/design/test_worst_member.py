@@ -110,10 +110,10 @@ def test_region_corners_are_the_vertices():
 def test_a_peak_is_found_wherever_it_lies(top):
     """The peak is a Gaussian whose width is a quarter of the range: on an edge, on a face, inside, at a vertex."""
     region = cube(3)
-    found = search([region], lambda m: float(np.exp(-np.sum(((point_of(m) - region.low) / 10 - top) ** 2) / 0.0625)))
+    result = search([region], lambda m: float(np.exp(-np.sum(((point_of(m) - region.low) / 10 - top) ** 2) / 0.0625)))
     # The compass search ends with a step of 1/128 of the range, so that a parameter is wrong by about half a step.
-    np.testing.assert_allclose((point_of(found.worst[0].member) - region.low) / 10, top, rtol=0, atol=1 / 128)
-    assert found.worst[0].ratio > 0.99
+    np.testing.assert_allclose((point_of(result.worst[0].member) - region.low) / 10, top, rtol=0, atol=1 / 128)
+    assert result.worst[0].ratio > 0.99
 
 
 @pytest.mark.slow
@@ -125,9 +125,9 @@ def test_many_parameters_find_the_worst_vertex():
     def need(member: Member) -> float:
         return float(signs @ (point_of(member) - region.low))
 
-    found = search([region], need)
-    np.testing.assert_array_equal((point_of(found.worst[0].member) - region.low) / 10, signs > 0)
-    assert not found.ended
+    result = search([region], need)
+    np.testing.assert_array_equal((point_of(result.worst[0].member) - region.low) / 10, signs > 0)
+    assert not result.ended
     short = search([region], need, work=-1.0)
     assert short.ended == "work"
     assert "counted work ended" in str(SearchFigures.of(short))
@@ -140,22 +140,22 @@ def test_many_parameters_find_the_worst_vertex():
 
 def test_both_regions_are_searched_worst_first():
     one, other = cube(1), cube(2)
-    found = search([one, other], lambda m: float(point_of(m).sum()))
-    assert found.worst[0].ratio == 21  # the upper ends of [0, 10] and [1, 11]
-    assert [f.ratio for f in found.worst] == sorted((f.ratio for f in found.worst), reverse=True)
-    assert 10 in [f.ratio for f in found.worst]  # the upper end of the first region
+    result = search([one, other], lambda m: float(point_of(m).sum()))
+    assert result.worst[0].ratio == 21  # the upper ends of [0, 10] and [1, 11]
+    assert [f.ratio for f in result.worst] == sorted((f.ratio for f in result.worst), reverse=True)
+    assert 10 in [f.ratio for f in result.worst]  # the upper end of the first region
 
 
 def test_a_region_without_ranges_is_one_environment():
-    found = search([cube(0)], lambda m: 0.5)
-    assert (found.tried, [f.ratio for f in found.worst]) == (1, [0.5])
+    result = search([cube(0)], lambda m: 0.5)
+    assert (result.tried, [f.ratio for f in result.worst]) == (1, [0.5])
 
 
 def test_progress_ends_at_its_total():
-    told = []
-    search([cube(2)], lambda m: float(point_of(m)[0]), lambda done, total: told.append((done, total)))
-    assert told[-1][0] == told[-1][1]
-    assert all(done <= total for done, total in told)
+    progress = []
+    search([cube(2)], lambda m: float(point_of(m)[0]), lambda done, total: progress.append((done, total)))
+    assert progress[-1][0] == progress[-1][1]
+    assert all(done <= total for done, total in progress)
 
 
 # In RANGED, VERTICES_ONLY is certified at every vertex and at 64 random points, and violated on an edge.
@@ -164,15 +164,15 @@ def test_progress_ends_at_its_total():
 @pytest.mark.slow
 def test_edge_violations_match_a_dense_sweep(known):
     """The worst member has its springs at their upper ends and a mass between 0.5 and 2 kg."""
-    found = known.searched.worst[0]
-    near = found.member.network.masses["mass"] + np.linspace(-0.05, 0.05, 7)
+    worst = known.searched.worst[0]
+    near = worst.member.network.masses["mass"] + np.linspace(-0.05, 0.05, 7)
     masses = np.concatenate([np.linspace(0.5, 2.0, 13), near])
     edge = [needed(Network(FIGURE_4.contacts, STIFF, {"mass": m}), VERTICES_ONLY) for m in masses]
-    assert found.member.network.springs == STIFF
+    assert worst.member.network.springs == STIFF
     # The grid by hand may miss the resonance's peak, here by 5e-5. Near the worst mass the ratio hardly changes.
-    assert found.ratio == pytest.approx(max(edge), abs=1e-3)
-    assert found.ratio == pytest.approx(1.0428, abs=1e-3)
-    assert found.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
+    assert worst.ratio == pytest.approx(max(edge), abs=1e-3)
+    assert worst.ratio == pytest.approx(1.0428, abs=1e-3)
+    assert worst.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
 
 
 @pytest.mark.slow
@@ -223,9 +223,9 @@ def test_design_check_repeats_the_search(tmp_path, capsys):
 
 @pytest.mark.validate
 def test_range_designs_hold_between_their_ends():
-    found = optimal.design(MASS, Options(bases=((4, 3),)))
-    assert found.proved
-    E = np.array([needed_by_filter(with_mass(mass), found.coupling) for mass in np.geomspace(0.25, 4.0, 30)])
+    optimum = optimal.design(MASS, Options(bases=((4, 3),)))
+    assert optimum.proved
+    E = np.array([needed_by_filter(with_mass(mass), optimum.coupling) for mass in np.geomspace(0.25, 4.0, 30)])
     assert E.max() < 1
     assert E.max() > 0.9  # the design uses over 90 % of the damping
 

@@ -156,7 +156,7 @@ def hill(elastic=400.0, damping=9.0, tissue=0.004, parallel=150.0, mass=0.25):
     return Port([mass, tissue], across, [0.0, damping, 0.5], [elastic, 0.0, parallel], pull=1)
 
 
-def test_a_port_is_its_matrices():
+def test_the_plant_has_the_ports_matrices():
     port, d = hill(), DEVICE
     got = plant(build([d], [Own(port)]).model)
     K = np.array([[400 + 150, -400], [-400, 400.0]])

@@ -46,14 +46,14 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
     return World(path, [Contact(name, along) for name in contacts], springs, options.pop("T", T), **options)
 
 
-# ---- the step
+# The step
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_linear_scene_is_the_network(tmp_path, coupling):
     """Behind a coupling the scene sends the network's forces for one second, and u = x - V f.
 
-    Tendon springs are longer by 1e-12 of their 0.1 m, which is 9e-11 N; rounding of the lengths adds 1e-14 N a tick.
+    Tendon springs are longer by 1e-12 of 0.1 m, which is at most 8e-11 N. Rounding of lengths adds 1e-14 N a tick.
     """
     V = coupling.compliance(T)
     port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
@@ -100,7 +100,7 @@ def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
     scene = World(path, [Contact("tip", plane), Contact("one")], [G[:2, :2], G[2:, 2:]], T)
     port, limits = scene.port([3.0, 3.0, 2.0], [slice(0, 2)] * radial), np.array([3.0, 3.0, 2.0])
 
-    def given(force):
+    def within(force):
         inside = np.clip(force, -limits, limits)
         if radial and np.linalg.norm(force[:2]) > 3.0:
             inside[:2] = force[:2] * 3.0 / np.linalg.norm(force[:2])
@@ -114,14 +114,14 @@ def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
         u = u + T * v
         assert np.abs(port.u - u).max() < 1e-11
         spring = G @ (goal - u)
-        assert np.abs(force - given(spring)).max() < 1e-5  # a limited force is turned by less than 1e-6 of its limit
+        assert np.abs(force - within(spring)).max() < 1e-5  # a limited force is turned by less than 1e-6 of its limit
         hit += np.abs(force - spring)[:2].max() > 1e-3
         inner += np.abs(force - spring)[:2].max() < 1e-9
     assert min(hit, inner) > 20
     assert port.unsettled == 0
 
 
-def test_a_ball_has_one_limit(tmp_path):
+def test_limits_within_a_ball_must_be_equal(tmp_path):
     text = f'<mujoco><worldbody><body name="tip">{FREE}</body></worldbody></mujoco>'
     scene = world(tmp_path, text, ["tip"], [np.eye(2) * 500], along=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     with pytest.raises(ValueError, match="expected one for its length"):
@@ -173,7 +173,7 @@ def test_released_energy_is_that_of_gravity_and_springs(tmp_path):
     assert most > 0.2
 
 
-# ---- the lemma
+# The lemma
 
 #: condim, impratio, d of solimp, solref, solreffriction of all contacts
 SCENES = (
@@ -272,7 +272,7 @@ def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
     assert pressed > 100
 
 
-# ---- a linear model
+# A linear model
 
 
 def test_linear_scenes_linearise_to_their_network(tmp_path):
@@ -333,7 +333,7 @@ def test_soft_bodies_lose_energy_and_are_listed(tmp_path):
     assert [part.what for part in port.world.parts() if "bodies" in part.what] == ["soft bodies"]
 
 
-# ---- masses and refusals
+# Masses and refusals
 
 
 @pytest.mark.parametrize("gravity", ['<option><flag gravity="disable"/></option>', '<option gravity="0 0 0"/>', ""])
@@ -426,14 +426,16 @@ def test_bodies_that_are_no_contacts_are_refused(tmp_path, text, message):
 
 def test_scene_defaults_do_not_reach_slides(tmp_path):
     plain = world(tmp_path, with_body(f'<body name="left">{FREE}</body>'))
-    joint = '<default><joint damping="3" armature="1" frictionloss="2" range="-1 1" limited="true"/></default>'
+    joint = """<default><joint damping="3" armature="1" frictionloss="2" range="-1 1" limited="true"
+    actuatorgravcomp="true" actuatorfrclimited="true" actuatorfrcrange="-.001 .001"/></default>"""
     dressed = world(
         tmp_path, with_body(f'<body name="left">{FREE}</body>').replace("<worldbody>", joint + "<worldbody>")
     )
     for scene in (plain, dressed):
         model = scene.model
-        for part in (model.dof_damping, model.dof_armature, model.dof_frictionloss, model.jnt_limited):
-            assert not part.any()
+        for part in ("dof_damping", "dof_armature", "dof_frictionloss", "jnt_limited", "jnt_actfrclimited"):
+            assert not getattr(model, part).any()
+        assert not model.jnt_actgravcomp.any()
         assert model.body("left").mass == model.body("right").mass == 0.03
 
 
@@ -537,16 +539,6 @@ actuatorfrcrange="-.01 .01"/><geom type="box" size="0.01 0.01 0.01" mass="0.3"/>
     assert port._potential() - low == pytest.approx(0.3 * 9.81 * 0.2, rel=1e-12)
 
 
-def test_defaults_do_not_change_the_slides(tmp_path):
-    default = """<default><joint actuatorgravcomp="true" actuatorfrclimited="true" actuatorfrcrange="-.001 .001"/>
-</default>"""
-    text = f"""<mujoco>{default}<worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody>
-</mujoco>"""
-    model = world(tmp_path, text, along=((0.0, 0.0, 1.0),)).model
-    assert not model.jnt_actgravcomp.any()
-    assert not model.jnt_actfrclimited.any()
-
-
 def test_includes_beside_the_including_file_are_read(tmp_path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "part.xml").write_text('<mujoco><worldbody><body name="left"/></worldbody></mujoco>')
@@ -555,7 +547,7 @@ def test_includes_beside_the_including_file_are_read(tmp_path):
     assert files_of(tmp_path / "main.xml")[-1] == tmp_path / "sub" / "part.xml"
 
 
-def test_springs_that_yield_are_not_in_the_lemma(tmp_path):
+def test_the_lemma_excludes_springs_that_yield(tmp_path):
     yields = LINE.replace('axis="1 0 0"/>', 'axis="1 0 0" stiffness="100" springyield="0.004"/>')
     parts = {part.what: part.at_the_port for part in world(tmp_path, yields).parts()}
     assert "shell" in parts["springs that yield"]

@@ -84,13 +84,13 @@ def test_the_options_are_those_that_the_designs_take():
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
 
     loop = load().loop("I")
-    found = design_coupling(loop)
+    design = design_coupling(loop)
     assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert assess(loop, found).guarantee.environments == safe_with(report) == "this environment"
-    figures = transparency_of(loop, found)
+    assert assess(loop, design).guarantee.environments == safe_with(report) == "this environment"
+    figures = transparency_of(loop, design)
     assert figures.mismatch_db == report["assessment"]["transparency"]["relative_mismatch_db"]
-    assert figures == transparency_of(loop, found.coupling)
+    assert figures == transparency_of(loop, design.coupling)
     assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
     assert assess(loop, SpringDamper([2870, 2320], [5.47, 5.55])).guarantee is None
     ranges = replace(loop, ranges=Ranges(masses={"mass": (0.8, 1.2)}))
@@ -111,9 +111,9 @@ def test_rehearsed_sessions_finish_with_their_guarantee():
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
     assert force[-1] <= 2.5 + 1e-9  # [N] The last force is that of the motor test, which follows the coupling.
-    given = rehearse(scenario, SOFT, seconds=0.1)
-    assert given.coupling is SOFT
-    assert given.assessment.requirements["this-environment"].certified
+    soft = rehearse(scenario, SOFT, seconds=0.1)
+    assert soft.coupling is SOFT
+    assert soft.assessment.requirements["this-environment"].certified
 
 
 def test_a_session_that_is_refused_says_why():
@@ -162,12 +162,12 @@ def test_validate_equals_the_commands_verdict(tmp_path):
 
 
 def test_validate_passes_its_arguments_on(monkeypatch):
-    asked = []
-    monkeypatch.setattr("haptic_loop.sim.crowds.validate", lambda question, *rest: asked.append(question))
+    questions = []
+    monkeypatch.setattr("haptic_loop.sim.crowds.validate", lambda question, *rest: questions.append(question))
     validate(SHORT, SOFT)
     validate(SHORT, SOFT, limiter=False, traces="all")
     rho = assess(SHORT.loop("I"), SOFT).force_limits.rho
-    assert [(question.lag, question.all_traces) for question in asked] == [(rho, False), (None, True)]
+    assert [(question.lag, question.all_traces) for question in questions] == [(rho, False), (None, True)]
     assert rho is not None
 
 
@@ -181,13 +181,13 @@ def test_own_environments_start_without_energy():
 
 def test_designs_are_certified_and_act_as_couplings():
     loop = load().loop("I")
-    found = design_coupling(loop, condition="any-environment")
-    requirements = certify(loop, found)
+    design = design_coupling(loop, condition="any-environment")
+    requirements = certify(loop, design)
     assert requirements["any-environment"].certified
     assert requirements["any-environment"].proof == "rational"
     assert requirements["any-environment"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # 0.9999 of 1.37
-    assert certify(loop, found.coupling)["this-environment"].required == requirements["this-environment"].required
-    assert (validate(load(), found, humans=10, engine="exact", duration=0).exact < 0).all()
+    assert certify(loop, design.coupling)["this-environment"].required == requirements["this-environment"].required
+    assert (validate(load(), design, humans=10, engine="exact", duration=0).exact < 0).all()
 
 
 @pytest.mark.slow
@@ -315,9 +315,9 @@ def test_results_are_shown_in_one_line():
 def test_a_stored_design_runs_as_the_design(tmp_path):
     path = tmp_path / "design.json"
     assert design_command(["--out", str(path)]) == 0
-    stored, made = simulate(SHORT, str(path)), simulate(SHORT, design_coupling(LOOP))
-    np.testing.assert_array_equal(stored.f, made.f)
-    assert stored.meta["assessment"]["guarantee"] == made.meta["assessment"]["guarantee"]
+    stored, designed = simulate(SHORT, str(path)), simulate(SHORT, design_coupling(LOOP))
+    np.testing.assert_array_equal(stored.f, designed.f)
+    assert stored.meta["assessment"]["guarantee"] == designed.meta["assessment"]["guarantee"]
     assert (validate(SHORT, path, 5, engine="exact", duration=0).exact < 0).all()
     with pytest.raises(InputError, match=r"none\.json"):
         simulate(SHORT, "none.json")

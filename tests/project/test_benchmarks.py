@@ -54,11 +54,11 @@ def test_numpy_alone_finds_the_published_requirements(every):
     checker, compared = runpy.run_path(ROOT / "check.py"), 0
     for loop, row in list(ROWS.items())[::every]:
         for column in ("reference_this_environment", "reference_any_environment"):
-            found = checker[column](tomllib.loads((ROOT / "loops" / f"{loop}.toml").read_text()))
-            compared += bool(row[column]) and found is not None
+            recomputed = checker[column](tomllib.loads((ROOT / "loops" / f"{loop}.toml").read_text()))
+            compared += bool(row[column]) and recomputed is not None
             # A plain sweep of 40,000 points was within 4e-6 when measured; it does not see unstable loops ("inf").
-            if row[column] not in ("", "inf") and found is not None:
-                assert found == pytest.approx(float(row[column]), rel=2e-3), (loop, column)
+            if row[column] not in ("", "inf") and recomputed is not None:
+                assert recomputed == pytest.approx(float(row[column]), rel=2e-3), (loop, column)
     assert compared > 30 / every
     assert len((ROOT / "check.py").read_text().splitlines()) < 70
 

@@ -148,9 +148,9 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
     page = tmp_path / "page.md"
     page.write_text("<!-- measured: rows -->\n```text\n$ python -m x\n3 rows in 0.2 s\n```\n")
     monkeypatch.setattr(regenerate, "PAGES", [page])
-    for printed, found in (("noise\n3 rows in 9 s\n", 0), ("9 rows in 0.2 s\n", 1), ("", 1)):
+    for printed, different in (("noise\n3 rows in 9 s\n", 0), ("9 rows in 0.2 s\n", 1), ("", 1)):
         monkeypatch.setattr(regenerate, "run", lambda *words, out=printed: SimpleNamespace(stdout=out, returncode=0))
-        assert regenerate.check() == found
+        assert regenerate.check() == different
     assert "the command prints  9 rows in 0.2 s" in capsys.readouterr().out
 
 
@@ -160,8 +160,8 @@ def test_page_blocks_end_and_follow_their_comments(page):
     assert len(fences) % 2 == 0
     assert set(fences[1::2]) <= {"```"}, "a code block has no end"
     assert all(fence.startswith("```") for fence in fences)
-    asked = re.findall(r"^<!-- (?:output|measured)\b", TEXTS[page], re.MULTILINE)
-    assert len(asked) == sum(block[0] == page for block in SHOWN + MEASURED)
+    comments = re.findall(r"^<!-- (?:output|measured)\b", TEXTS[page], re.MULTILINE)
+    assert len(comments) == sum(block[0] == page for block in SHOWN + MEASURED)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -13,7 +13,7 @@ SLOW += ("first_steps", "neural_environment", "compare_couplings")
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "classics")  # test_classics.py runs its rows
 
 #: patterns that each example must print; docs and other tests have the same figures
-SAYS = {
+PRINTED = {
     "audit": ["this-environment: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
     "compare_couplings": [
         "any passive environment",
@@ -69,7 +69,7 @@ SHORTER = {
 }
 
 #: command-line arguments of two examples
-ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
+ARGUMENTS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
 
 @pytest.mark.slow
@@ -100,9 +100,9 @@ def test_an_example_runs(path, change, tmp_path):
         assert text.count(change[0]) == 1
         file = tmp_path / path.name
         file.write_text(text.replace(*change))
-    done = run(["python", file, *ASKS.get(path.stem, ())], tmp_path)
+    done = run(["python", file, *ARGUMENTS.get(path.stem, ())], tmp_path)
     assert done.returncode == 0, done.stderr
-    missing = [words for words in SAYS[path.stem] if not re.search(words, done.stdout)]
+    missing = [words for words in PRINTED[path.stem] if not re.search(words, done.stdout)]
     assert not missing, done.stdout
     if path.stem in SEARCHED_FOR:
         assert [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".pdf") and file.stat().st_size > 5000]

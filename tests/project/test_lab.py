@@ -37,15 +37,15 @@ def test_commands_lead_from_a_scenario_to_c(tmp_path, monkeypatch, capsys):
     others = json.loads(Path("compare/report.json").read_text())["alternatives"]
     assert [other["coupling"] for other in others] == ["none", "spring-damper", "spring-damper", "optimal"]
     assert not any("reason" in other for other in others)
-    for name, asked in DESIGNS:
-        go("design", *lab, *asked, "--out", f"{name}.json")
+    for name, options in DESIGNS:
+        go("design", *lab, *options, "--out", f"{name}.json")
         go("check", f"{name}.json")
         go("export", f"{name}.json", "--process", "--out", f"{name}.c")
     go("audit", *lab, "--coupling", "here.json", "--out", "audit")
     go("validate", *lab, "--coupling", "here.json", "--humans", "5", "--duration", "0", "--no-plot", "--out", "v")
-    said = capsys.readouterr().err
-    assert "error" not in said
-    assert "not possible" not in said
+    errors = capsys.readouterr().err
+    assert "error" not in errors
+    assert "not possible" not in errors
     if shutil.which("cc"):  # the exported tick passes its own test
         subprocess.run(["cc", "-std=c99", "-DHAPTIC_LOOP_TEST", "here.c", "-lm", "-o", "here"], check=True)
         subprocess.run(["./here"], check=True)

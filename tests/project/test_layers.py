@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from haptic_loop.models.device import CompliantDevice
 
 ROOT = Path(__file__).parents[2]
-WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
+FOLDERS = ("models", "controller", "design", "sim", "hw", "cli")
 
 #: A folder may import itself and these folders.
 MAY_IMPORT = {
@@ -27,7 +27,7 @@ MAY_IMPORT = {
 }
 
 #: the only files that may import a package
-HOMES = {
+ONLY_IN = {
     # sim/view/ draws shapes and arrows, in a window or in pictures without a window
     "mujoco": {"models/scene.py", "models/world.py", "sim/engines.py", "sim/view/"},
     "cvxpy": {"design/lmi.py"},  # the paper's lemmas as cvxpy expressions
@@ -37,10 +37,10 @@ HOMES = {
     "PIL": {"sim/view/"},
 }
 
-FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"))]
+FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 
 
-def is_door(node: ast.stmt) -> bool:
+def is_main_block(node: ast.stmt) -> bool:
     """Return whether a statement is the `if __name__ == "__main__":` tail of a file, whose imports do not count."""
     return isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
 
@@ -62,22 +62,22 @@ def _nodes(path: Path) -> list[ast.AST]:
 
 #: names of conditions, with which only the files AT_HOME may compare
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
-AT_HOME = ("design/conditions", "design/environments", "design/result")
+EXEMPT = ("design/conditions", "design/environments", "design/result")
 
 
 @pytest.mark.slow
 def test_no_code_compares_names_of_conditions():
     """A user's own condition works in every command, since no code decides by a condition's name."""
-    asking = []
+    comparisons = []
     for path in FILES:
         place = path.relative_to(ROOT).as_posix().removesuffix(".py")
         named = any(name in path.read_text() for name in CONDITIONS)
-        for node in _nodes(path) if named and place not in AT_HOME else ():
+        for node in _nodes(path) if named and place not in EXEMPT else ():
             if isinstance(node, ast.Compare | ast.match_case):
                 parts = [getattr(part, of, None) for part in ast.walk(node) for of in ("value", "id", "attr")]
                 if any(w in CONDITIONS for w in parts if isinstance(w, str)):
-                    asking.append(f"{place}: {ast.unparse(node)}")
-    assert not asking
+                    comparisons.append(f"{place}: {ast.unparse(node)}")
+    assert not comparisons
 
 
 @cache
@@ -85,7 +85,7 @@ def imported(path: Path) -> set[str]:
     """Return the full names of all modules that a file imports, at its head, later or by a string."""
     names = set()
     for top in _tree(path).body:
-        for node in () if is_door(top) else ast.walk(top):
+        for node in () if is_main_block(top) else ast.walk(top):
             if isinstance(node, ast.Import):
                 names |= {alias.name.removeprefix("haptic_loop.") for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -115,8 +115,8 @@ def all_imports() -> list[tuple[str, str]]:
 def test_folders_import_only_allowed_folders():
     wrong = []
     for place, name in all_imports():
-        world, package = place.split("/")[0], name.split(".")[0]
-        if package in WORLDS and package != world and package not in MAY_IMPORT[world]:
+        folder, package = place.split("/")[0], name.split(".")[0]
+        if package in FOLDERS and package != folder and package not in MAY_IMPORT[folder]:
             wrong.append(f"{place} imports {name}")
     assert not wrong
 
@@ -124,8 +124,8 @@ def test_folders_import_only_allowed_folders():
 def test_large_packages_are_imported_in_few_files():
     wrong = []
     for place, name in all_imports():
-        homes = HOMES.get(name.split(".")[0])
-        if homes and not any(place.startswith(home) for home in homes):
+        places = ONLY_IN.get(name.split(".")[0])
+        if places and not any(place.startswith(home) for home in places):
             wrong.append(f"{place} imports {name}")
     assert not wrong
 
@@ -153,7 +153,7 @@ def circle(arrows: dict[str, set[str]]) -> list[str] | None:
 def between_files() -> dict[str, set[str]]:
     arrows = {}
     for path in FILES:
-        targets = {file_of(name) for name in imported(path) if name.split(".")[0] in WORLDS} - {None, path}
+        targets = {file_of(name) for name in imported(path) if name.split(".")[0] in FOLDERS} - {None, path}
         # a package's __init__.py has only a docstring, or imports for type checkers only
         arrows[str(path.relative_to(ROOT))] = {str(t.relative_to(ROOT)) for t in targets if t.name != "__init__.py"}
     return {name: after for name, after in arrows.items() if not name.endswith("__init__.py")}
@@ -173,9 +173,9 @@ def test_folders_have_no_import_cycle():
 
 def test_the_check_sees_forbidden_imports_and_cycles(tmp_path):
     wrong = tmp_path / "wrong.py"
-    door = "if __name__ == '__main__':\n    import cli.run\n"
+    main_block = "if __name__ == '__main__':\n    import cli.run\n"
     wrong.write_text(
-        f"import numpy\nfrom haptic_loop.sim.run import run\nimport_module('haptic_loop.hw.session')\n{door}"
+        f"import numpy\nfrom haptic_loop.sim.run import run\nimport_module('haptic_loop.hw.session')\n{main_block}"
     )
     assert imported(wrong) == {"numpy", "sim.run", "hw.session"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
