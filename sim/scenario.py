@@ -41,8 +41,8 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
-_MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take 2 s of CPU time
-_MOST_CHANNELS = 32  # sim.run with 32 channels and no coupling takes 6 s of CPU time
+_MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take about a second
+_MOST_CHANNELS = 32  # sim.run with 32 channels takes seconds, and a design tens of seconds
 _LONGEST_NAME = 200  # characters
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]
