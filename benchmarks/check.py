@@ -60,6 +60,6 @@ if __name__ == "__main__":
     for row in csv.DictReader((HERE / "figures.csv").open()):
         loop = tomllib.loads((HERE / "loops" / f"{row['loop']}.toml").read_text())
         for name in [name for name in row if callable(yours.get(name)) and row[name]]:
-            if (found := yours[name](loop)) is not None:
+            if (computed := yours[name](loop)) is not None:
                 published = float(row[name])
-                print(f"{row['loop']:26} {name:28} {published:10.5g} {found:10.5g} {found / published - 1:+.1e}")
+                print(f"{row['loop']:26} {name:28} {published:10.5g} {computed:10.5g} {computed / published - 1:+.1e}")

@@ -89,7 +89,7 @@ class Row:
     engine: str
     integrator: str | None
     substeps: int | None
-    position_relative_rms: float | None  # as in PositionError
+    position_relative_rms: float | None  # rms error of positions over the rms of the exact positions
     growth_rate_error: float  # [1/s] the error with or without the coupling, whichever is larger in magnitude
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of one channel's force in the limit cycle without coupling

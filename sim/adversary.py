@@ -107,7 +107,7 @@ def search(
         )
         done = (trial + 1) * generations
         evaluated += (optimum.nit + 1) * (_CANDIDATES // len(ranges)) * len(ranges)
-        worst = _worst(scenario, F, _ladders(optimum.x[:, None], scenario.device, kind), evaluated)
+        worst = _worst(scenario, F, _lossless_humans(optimum.x[:, None], scenario.device, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
             break
@@ -156,7 +156,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     return ranked
 
 
-def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
+def _lossless_humans(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
     """Convert logarithms of masses and stiffnesses, (2 * devices * links, nsim), to lossless humans.
 
     If one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. If all
@@ -183,7 +183,7 @@ def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
 
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Return minus the largest growth [1/s] among the modes of the pass, for every column of x."""
-    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.device, kind))
+    loops = _loops(scenario, F, _lossless_humans(x.reshape(x.shape[0], -1), scenario.device, kind))
     (growth,) = loops.growths(kind.min_frequency_hz)
     return -growth
 

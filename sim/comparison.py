@@ -127,14 +127,14 @@ def _alternative(
     assessment = assessed(alone, case, replace(chosen, own=also or chosen.own))
     requirements = assessment.requirements
     simulation = assemble(scenario, chosen.coupling, assessment.force_limits.rho)
-    felt = transparency(simulation.felt, simulation.E, loop.lam)
+    figures = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     row = Alternative(
         kind,
         condition,
         guarantee=assessment.guarantee_words,
-        dc_ratio=finite(felt.dc_ratio),
-        rms_mismatch_db=decibels(felt.rms_mismatch),
+        dc_ratio=finite(figures.dc_ratio),
+        rms_mismatch_db=decibels(figures.rms_mismatch),
         growth_rate_per_s=finite(growth),
         required_damping={name: tuple(needs.required) for name, needs in requirements.items()},
         requirements=dict(requirements),
@@ -142,9 +142,9 @@ def _alternative(
     if scenario.environment.walls or simulation.friction:
         return row
     trace = run(simulation, "exact")
-    alike, until = force_error(simulation, trace, loop.lam), credible(simulation, trace).until_s
-    error = None if unstable(growth) else alike.error_percent
-    return replace(row, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
+    forces, until = force_error(simulation, trace, loop.lam), credible(simulation, trace).until_s
+    error = None if unstable(growth) else forces.error_percent
+    return replace(row, force_error_percent=error, trace=trace, ideal=forces.ideal, until_s=until)
 
 
 # ---- couplings over frequency

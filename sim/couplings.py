@@ -48,7 +48,7 @@ def choose(
         case: The reference delays, "I" or "II"; "none" for the loop without a coupling.
         name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
         condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
-        limiter: For kinds whose proof covers limited forces if possible: True to require that, False to ignore limits.
+        limiter: For kinds with proofs for limited forces: True requires such a proof, False ignores the limits.
         progress: Called during long searches with (task, steps done, number of steps).
 
     Raises:

@@ -237,7 +237,7 @@ def _group(
     ticked: Callable[[int], None],
 ) -> Findings:
     """Judge and simulate humans whose ports have the same structure."""
-    scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
+    scenario, missing = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
     late = scenario.usual_latency
     plants = hold(held_by.plants(), scenario.T, late)
@@ -246,14 +246,14 @@ def _group(
     damping = np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)
     lossless = np.stack([port.damping.max(axis=1) for port in crowd.ports], axis=1).min(axis=1) == 0
     other, growth = _other_engine(validation, simulation, held_by, crowd, frozen)
-    mujoco = nowhere if growth is None else growth
+    mujoco = missing if growth is None else growth
     exact: ImpulseTest | None = None
     witnesses = np.zeros(0, dtype=np.intp)
     if validation.ticks:
         if other:
             witnesses = _witnessed(validation, index, mode.growth, lossless)
         exact = _traced(validation, simulation, held_by, loops, plants, other, witnesses, ticked)
-    switched = Switched(nowhere, nowhere)
+    switched = Switched(missing, missing)
     if scenario.switches or scenario.uneven:
         also = other if validation.ticks else None
         switched = switched_crowd(simulation, held_by, index, validation.seed, validation.duration, also)
@@ -263,13 +263,13 @@ def _group(
         exact=mode.growth,
         frequency=mode.frequency_hz,
         mujoco=mujoco,
-        trace=exact.growth if exact else nowhere,
+        trace=exact.growth if exact else missing,
         witnessed=np.isin(np.arange(len(crowd)), witnesses),
-        trace_error=exact.error if exact else nowhere,
+        trace_error=exact.error if exact else missing,
         clipped=exact.clipped if exact else np.zeros(len(crowd), dtype=int),
-        energy=exact.least_energy if exact else nowhere,
-        audited=exact.audited if exact else nowhere,
-        settling=exact.settling if exact else nowhere,
+        energy=exact.least_energy if exact else missing,
+        audited=exact.audited if exact else missing,
+        settling=exact.settling if exact else missing,
         contacts=exact.contacts if exact else np.zeros(len(crowd), dtype=int),
         mass=_geometric_mean(np.stack([port.mass.sum(axis=1) for port in crowd.ports], axis=1)),
         damping=_geometric_mean(damping),
@@ -290,7 +290,7 @@ def _other_engine(
     crowd: Crowd | HumanSets,
     frozen: Collection[Lti],
 ) -> tuple[_Other | None, Array | None]:
-    """Return what makes the other engine, and the growth rates of its period maps; (None, None) if there is no other.
+    """Return a factory of the other engine and the growth rates of its period maps; (None, None) without other engine.
 
     `frozen` has the force map for each set of touching walls. A user's own engine gives its map by one step from each
     basis state.
@@ -416,7 +416,7 @@ def _in_processes(question: Validation, shards: int, parts: dict[int, Findings],
     batches, alone = question.batches(), replace(question, threads=1)
     # A forked child would inherit locks of MuJoCo's threads and of the progress bar.
     context = multiprocessing.get_context("spawn")
-    strangers = set(multiprocessing.active_children())
+    others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_as_worker)
     futures = dict[Future[Findings], int]()
     try:
@@ -429,7 +429,7 @@ def _in_processes(question: Validation, shards: int, parts: dict[int, Findings],
         for future, number in futures.items():
             if future.done() and not future.cancelled() and not future.exception():
                 parts[number] = future.result()
-        for worker in set(multiprocessing.active_children()) - strangers:
+        for worker in set(multiprocessing.active_children()) - others:
             worker.terminate()  # Waiting for a batch could take half a minute.
         raise
     finally:

@@ -229,7 +229,7 @@ class _Access:
     step: Callable[[int], object]  # makes a number of steps
     pace: Callable[[float], object]  # sets the length of a step [s]
     move: Callable[[float], Product] | None  # seconds -> exponential step from [s; qacc] to s+
-    kick: Callable[[float], Product] | None  # seconds -> step of the impedances alone, from s to s
+    kick: Callable[[float], Product] | None  # seconds -> step of s that changes the impedances and speeds only
 
     def put(self, buffer: StepBuffer, k: int) -> None:
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)

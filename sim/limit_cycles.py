@@ -94,7 +94,7 @@ class HeldDevices:
         return everything, turning
 
     def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:
-        """Return the dominant mode above a frequency, as a state [s; z] of plant and process.
+        """Return the dominant mode at or above a frequency, as a state [s; z] of plant and process.
 
         The mode is scaled so that the motor or handle with the largest motion moves by 1 m.
         """

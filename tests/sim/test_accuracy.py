@@ -9,7 +9,7 @@ import pytest
 from haptic_loop.cli.accuracy import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.models.device import RigidDevice
-from haptic_loop.sim import accuracy as yardstick
+from haptic_loop.sim import accuracy as accuracy_module
 from haptic_loop.sim.accuracy import Row, _with_front, credible, measure, position_error, reference
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError, load
@@ -21,7 +21,7 @@ def report(tmp_path_factory):
     """Return the exit code and the report of the command. Each setting runs once, because no test needs exact times."""
     place = tmp_path_factory.mktemp("accuracy")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(yardstick, "_REPEATS", 1)
+        patch.setattr(accuracy_module, "_REPEATS", 1)
         code = main(["--duration", "2", "--out", str(place / "o"), "--json", str(place / "r.json")])
     assert (place / "o" / "accuracy.png").stat().st_size > 10_000
     return code, json.loads((place / "r.json").read_text())

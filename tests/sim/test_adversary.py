@@ -123,11 +123,11 @@ def test_a_found_person_replays_with_equal_spectral_radius(tmp_path, monkeypatch
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--case", "none", "--engine", "exact", "--no-plot", "--out", str(out), "--json", str(file)]
     assert main([*base, "--humans", "5", "--duration", "0", "--adversary", "--generations", "8"]) == 0
-    found = json.loads(file.read_text())["adversary"]
-    assert found["person"][0]["holds"] == [1, 2]
+    worst = json.loads(file.read_text())["adversary"]
+    assert worst["person"][0]["holds"] == [1, 2]
     assert run_command.main([*base, "--human", str(out / "adversary.toml"), "--duration", "0.5"]) == 0
     stability = json.loads(file.read_text())["stability"]
-    assert stability["spectral_radius"] == pytest.approx(found["spectral_radius"], abs=1e-12)
+    assert stability["spectral_radius"] == pytest.approx(worst["spectral_radius"], abs=1e-12)
 
 
 @pytest.mark.slow
@@ -175,8 +175,8 @@ def test_validation_fails_if_an_adversary_contradicts_a_certificate(tmp_path, mo
 @pytest.mark.slow
 def test_attacks_succeed_only_below_the_required_damping():
     rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 4))
-    found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
-    assert found == {0: [False, False], 0.2: [True, True]}
+    succeeded = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
+    assert succeeded == {0: [False, False], 0.2: [True, True]}
     assert {row.loop for row in rows} == {"no coupling", "spring-damper, case I"}
     assert all(row.holds for row in rows)
 
@@ -184,11 +184,11 @@ def test_attacks_succeed_only_below_the_required_damping():
 def test_a_wrong_condition_fails_the_check(monkeypatch):
     """The search refutes a condition that requires 0.5 N s/m of each device, where 1.72 N s/m are needed."""
 
-    class Third(ThisEnvironment):
+    class TooWeak(ThisEnvironment):
         def required(self, loop, coupling, multiplier=None):
             return replace(super().required(loop, coupling), required=(0.5, 0.5))
 
-    monkeypatch.setattr("tests.checks.tightness.THIS_ENVIRONMENT", Third())
+    monkeypatch.setattr("tests.checks.tightness.THIS_ENVIRONMENT", TooWeak())
     (row,) = shortages(1, ("none",), (0,), 5)
     assert row.found
     assert not row.holds

@@ -181,8 +181,8 @@ def test_springs_in_space_match_closed_form_matrices() -> None:
         inner = one + two + 0.3 * s[k] ** 2
         left = stiffness + s[k] * np.diag([0.5, 0.2, 0.1]) + (one - one**2 / inner) * eye
         right = 50 * np.outer(along, along) + (two - two**2 / inner) * eye
-        whole = np.block([[left, -one * two / inner * eye], [-one * two / inner * eye, right]])
-        assert np.abs(E - whole).max() < 1e-9 * np.abs(whole).max()
+        expected = np.block([[left, -one * two / inner * eye], [-one * two / inner * eye, right]])
+        assert np.abs(E - expected).max() < 1e-9 * np.abs(expected).max()
 
 
 def wall_forces(network: Network, x: Array) -> Array:
@@ -272,10 +272,10 @@ def test_plant_with_matrices_equals_a_matrix_exponential() -> None:
     held = Human((Link(0.3, tuple(map(tuple, hand.tolist())), tuple(map(tuple, K.tolist()))),))
     plant, eye, zero = build((device,), (held,)).plant, np.eye(3), np.zeros((3, 3))
     A = np.block([[zero, eye], [-K / 0.55, -(hand + DAMPING) / 0.55]])
-    whole = scipy.linalg.expm(1e-3 * np.block([[A, np.vstack([zero, -eye / 0.55])], [np.zeros((3, 9))]]))
+    exact = scipy.linalg.expm(1e-3 * np.block([[A, np.vstack([zero, -eye / 0.55])], [np.zeros((3, 9))]]))
     step = hold(plant, 1e-3)
-    assert np.abs(step.A - whole[:6, :6]).max() < 1e-12
-    assert np.abs(step.B[:, -3:] - whole[:6, 6:]).max() < 1e-12
+    assert np.abs(step.A - exact[:6, :6]).max() < 1e-12
+    assert np.abs(step.B[:, -3:] - exact[:6, 6:]).max() < 1e-12
 
 
 # ---- hands in space
@@ -330,13 +330,13 @@ def test_voluntary_motion_follows_its_direction() -> None:
 
 def test_actuators_limit_forces_to_a_ball_or_box() -> None:
     process = assemble(scenario("force_limit = 3.0", "force_limit = [1.0, 2.0, 3.0]"), COUPLING).process
-    asked = 5 * np.random.default_rng(0).normal(size=(6, 400))
-    given = process.applied(asked)
-    ball, box = given[:3], given[3:]
-    length = np.linalg.norm(asked[:3], axis=0)
-    assert np.allclose(ball, asked[:3] * np.minimum(1, 3 / length), rtol=1e-14, atol=0)
-    assert np.array_equal(box, np.clip(asked[3:], [[-1.0], [-2.0], [-3.0]], [[1.0], [2.0], [3.0]]))
-    limited = at_limit(given[None], process.force_limit, process.balls)[0]
+    wanted = 5 * np.random.default_rng(0).normal(size=(6, 400))
+    applied = process.applied(wanted)
+    ball, box = applied[:3], applied[3:]
+    length = np.linalg.norm(wanted[:3], axis=0)
+    assert np.allclose(ball, wanted[:3] * np.minimum(1, 3 / length), rtol=1e-14, atol=0)
+    assert np.array_equal(box, np.clip(wanted[3:], [[-1.0], [-2.0], [-3.0]], [[1.0], [2.0], [3.0]]))
+    limited = at_limit(applied[None], process.force_limit, process.balls)[0]
     assert np.array_equal(limited[0], length >= 3)
 
 

@@ -4,14 +4,9 @@ import pytest
 
 from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 
-#: the guarantees whose tests take longest
-SLOW = ("limited, any environment", "energy budget")
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GUARANTEES]
-)
+@pytest.mark.parametrize("name", GUARANTEES)
 def test_requirements_suffice_and_much_less_fails(name):
     """With 1.02 times what a guarantee requires, no adversary takes too much energy; with far less, one does.
 

@@ -31,19 +31,14 @@ def small_batches(monkeypatch):
     monkeypatch.setattr(crowds, "_BATCH", _BATCH)
 
 
-def kill_when_there(times: int, strangers) -> threading.Thread:
-    """Start a thread that kills `times` child processes that are not in `strangers`, one after another."""
+def kill_the_next_child() -> threading.Thread:
+    """Start a thread that kills the first child process that begins after this call."""
+    before = set(multiprocessing.active_children())
 
     def work() -> None:
-        left = times
-        while left:
-            for child in set(multiprocessing.active_children()) - strangers:
-                if child.pid:
-                    os.kill(child.pid, signal.SIGKILL)
-                    child.join()
-                    left -= 1
-                    break
+        while not (children := set(multiprocessing.active_children()) - before):
             time.sleep(0.05)
+        children.pop().kill()
 
     thread = threading.Thread(target=work)
     thread.start()
@@ -52,22 +47,22 @@ def kill_when_there(times: int, strangers) -> threading.Thread:
 
 def test_a_killed_worker_ends_the_validation():
     """The finished batches have the findings of an undisturbed validation."""
-    killer = kill_when_there(1, set(multiprocessing.active_children()))
+    killer = kill_the_next_child()
     findings = validate(QUESTION, shards=2)
     killer.join()
     assert findings.lost == "a worker process died"
-    whole = validate(QUESTION)
-    np.testing.assert_array_equal(findings.exact, whole.exact[findings.index])
+    undisturbed = validate(QUESTION)
+    np.testing.assert_array_equal(findings.exact, undisturbed.exact[findings.index])
 
 
 def test_reports_count_humans_finished_before_memory_ran_out(tmp_path, monkeypatch, capsys):
     real, calls = crowds._examine, []
 
-    def fails(*words):
-        calls.append(words)
+    def fails(*arguments):
+        calls.append(arguments)
         if len(calls) > 1:
             raise MemoryError
-        return real(*words)
+        return real(*arguments)
 
     monkeypatch.setattr(crowds, "_examine", fails)
     assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
@@ -85,19 +80,14 @@ def children(pid: int) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the kernel lists no children here")
-@pytest.mark.parametrize(
-    ("end", "words", "workers_and_their_clerk"),
-    [
-        (signal.SIGTERM, ["sim.validate", "--case", "none", "--humans", "100000", "--shards", "2"], 3),
-        (signal.SIGKILL, ["sim.validate", "--case", "none", "--humans", "100000", "--shards", "2"], 3),
-    ],
-)
-def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, workers_and_their_clerk):
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(tmp_path, end):
+    words = ["sim.validate", "--case", "none", "--humans", "100000", "--shards", "2"]
     command = [sys.executable, "-m", *words, "--out", str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while len(workers := children(process.pid)) < workers_and_their_clerk:  # the clerk: Python's resource tracker
+    while len(workers := children(process.pid)) < 3:  # two workers, and Python's resource tracker
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(0.2)

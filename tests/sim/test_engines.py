@@ -167,8 +167,8 @@ def test_the_profiler_clock_is_restored(simulation, monkeypatch):
     pointer = mujoco_engine._profiler_clock()
     assert isinstance(pointer, ctypes.c_void_p)
     before = pointer.value
-    with profiler_off() as found:
-        assert found
+    with profiler_off() as off:
+        assert off
         assert pointer.value is None
     assert pointer.value == before
     monkeypatch.setattr("haptic_loop.sim.run.profiler_off", nullcontext)
@@ -179,8 +179,8 @@ def test_the_profiler_clock_is_restored(simulation, monkeypatch):
 
 def test_runs_work_without_mujocos_profiler_clock(monkeypatch, simulation):
     monkeypatch.setattr(mujoco_engine, "_profiler_clock", lambda: None)
-    with profiler_off() as found:
-        assert not found
+    with profiler_off() as off:
+        assert not off
     assert run(simulation).s.shape[0] == SHORT.samples
 
 
@@ -193,9 +193,9 @@ def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(loop, "_SMALL", 0)
     monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
-    found = run(simulation, "exact")
+    stored = run(simulation, "exact")
     for name in ("t", "x", "f", "x_handle", "w", "z", "s"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(stored, name), getattr(expected, name))
     assert not any(tmp_path.iterdir())  # the trace's file has no name
     monkeypatch.setattr(loop, "_free_memory", lambda: 200 * ticks)
     with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .* allowed are 0.3 s"):

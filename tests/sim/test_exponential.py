@@ -93,9 +93,8 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     """The measured map equals exponentials by SciPy and in extended precision.
 
     Velocities are divided by `fastest`, about the fastest mode [rad/s], so that they are of the size of positions.
-    Rounding of the
-    generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number; rounding of the
-    result adds one `eps` for each term of its sums.
+    Rounding of the generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number.
+    Rounding of the result adds one `eps` for each term of its sums.
     """
     loop = stiff(stiffness)
     continuous, fastest = plant(loop.scene.model), np.sqrt(stiffness / 0.06)
@@ -318,10 +317,10 @@ def cheapest(loop, error, ticks):
 
 
 def test_one_exponential_step_is_cheapest_for_smooth_scenes(simulation):
-    found = cheapest(simulation, 1e-9, 500)
-    assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
-    assert found.position_relative_rms < 1e-11
-    assert found.cpu_s > 0
+    setting = cheapest(simulation, 1e-9, 500)
+    assert (setting.integrator, setting.substeps) == (EXPONENTIAL, 1)
+    assert setting.position_relative_rms < 1e-11
+    assert setting.cpu_s > 0
 
 
 @pytest.mark.slow
@@ -336,14 +335,14 @@ def test_with_friction_the_cheapest_setting_keeps_the_error():
         return np.sqrt(np.mean((positions(*setting) - truth) ** 2) / np.mean(truth**2))
 
     truth = positions("RK4", 64)
-    for asked, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-6, ("RK4",))):
-        choices = compare_engines(loop, asked, ticks)
+    for allowed, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-6, ("RK4",))):
+        choices = compare_engines(loop, allowed, ticks)
         assert all(choice.position_relative_rms > 0 for choice in choices)  # the reference has an error, too
-        found = pick(choices, asked)
-        assert found.integrator in expected  # exponential and Euler steps need one evaluation each
-        assert missed(found.integrator, found.substeps) <= found.position_relative_rms <= asked
-        if found.substeps > 1:
-            assert missed("RK4", found.substeps // 2) > asked / 4
+        chosen = pick(choices, allowed)
+        assert chosen.integrator in expected  # exponential and Euler steps need one evaluation each
+        assert missed(chosen.integrator, chosen.substeps) <= chosen.position_relative_rms <= allowed
+        if chosen.substeps > 1:
+            assert missed("RK4", chosen.substeps // 2) > allowed / 4
 
 
 def test_gaps_between_runs_bound_the_finest_error():
@@ -402,15 +401,15 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
 
 @pytest.mark.slow
 def test_engines_are_compared_on_the_actual_run():
-    scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
+    scenario, errors = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
     for net in (None, EnergyNet(0.0)):
-        done = run_scenario(scenario, NoCoupling(), settings=EngineSettings(error=1e-9), net=net)
-        assert (done.settings.integrator, done.settings.substeps) == (EXPONENTIAL, 1)
-        truth, own = (run(done.ran, make_engine(done.ran, *how)).x for how in (("exact",), ("mujoco", "RK4", 2)))
+        outcome = run_scenario(scenario, NoCoupling(), settings=EngineSettings(error=1e-9), net=net)
+        assert (outcome.settings.integrator, outcome.settings.substeps) == (EXPONENTIAL, 1)
+        truth, own = (run(outcome.ran, make_engine(outcome.ran, *how)).x for how in (("exact",), ("mujoco", "RK4", 2)))
         apart = np.sqrt(np.mean((own - truth) ** 2) / np.mean(truth**2))
-        found += [c.position_relative_rms for c in done.choices if c.name == "RK4 x 2"]
-        assert found[-1] == pytest.approx(apart)
-    assert found[0] != found[1]  # the energy budget changes the motion
+        errors += [c.position_relative_rms for c in outcome.choices if c.name == "RK4 x 2"]
+        assert errors[-1] == pytest.approx(apart)
+    assert errors[0] != errors[1]  # the energy budget changes the motion
 
 
 def test_the_cross_check_finds_wrong_matrices(monkeypatch):

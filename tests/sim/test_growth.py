@@ -35,52 +35,52 @@ def motion(seconds, *modes):
 )
 def test_measured_rates_equal_known_ones(frequency, rate):
     """The error is at most four standard errors, plus 0.02 1/s because voluntary motion disturbs the slowest octave."""
-    found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
-    assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
-    assert found.error_per_s < 0.2
-    assert found.frequency_hz == pytest.approx(frequency, abs=1.5)  # the spectrum's lines are 1 Hz apart
-    assert found.trend == ("grows" if rate > 0 else "decays")
+    measured = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
+    assert measured.growth_rate_per_s == pytest.approx(rate, abs=4 * measured.error_per_s + 0.02)
+    assert measured.error_per_s < 0.2
+    assert measured.frequency_hz == pytest.approx(frequency, abs=1.5)  # the spectrum's lines are 1 Hz apart
+    assert measured.trend == ("grows" if rate > 0 else "decays")
 
 
 def test_the_error_of_a_rate_is_its_scatter():
     """The rms of reported errors equals the scatter of rates over traces with different noise, within a third."""
     rng, truth = np.random.default_rng(3), 0.3
     clean = motion(6.0, (4e-4, 60.0, truth))
-    found = [growth(clean + 1e-4 * rng.normal(size=clean.shape), T, STEP) for _ in range(60)]
-    rates = np.array([one.growth_rate_per_s for one in found])
-    errors = np.array([one.error_per_s for one in found])
+    measured = [growth(clean + 1e-4 * rng.normal(size=clean.shape), T, STEP) for _ in range(60)]
+    rates = np.array([one.growth_rate_per_s for one in measured])
+    errors = np.array([one.error_per_s for one in measured])
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(np.std(rates), rel=1 / 3)
 
 
 def test_voluntary_motion_and_encoder_steps_are_no_oscillation():
-    found = growth(motion(6.0), T, STEP)
-    assert found.growth_rate_per_s is None
-    assert found.reason == "nothing oscillates above 1.1 um"
+    measured = growth(motion(6.0), T, STEP)
+    assert measured.growth_rate_per_s is None
+    assert measured.reason == "nothing oscillates above 1.1 um"
 
 
 def test_flicker_below_the_named_size_is_no_oscillation():
     """The first window sees 1.08 um at 5 Hz: more than the rounding in its octave, 0.2 um, but less than 1.1 um."""
-    found = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
-    assert found.reason == "nothing oscillates above 1.1 um"
+    measured = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
+    assert measured.reason == "nothing oscillates above 1.1 um"
 
 
 @pytest.mark.parametrize(("size", "rate", "end"), [(2e-5, 60.0, "still there"), (4e-10, -4.0, "gone")])
 def test_reasons_say_how_brief_oscillations_ended(size, rate, end):
-    found = growth(motion(6.0, (size, 84.0, rate)), T, STEP)
-    assert found.growth_rate_per_s is None
-    assert found.reason.endswith(f"was seen too briefly for a rate, and was {end} at the end")
+    measured = growth(motion(6.0, (size, 84.0, rate)), T, STEP)
+    assert measured.growth_rate_per_s is None
+    assert measured.reason.endswith(f"was seen too briefly for a rate, and was {end} at the end")
 
 
 def test_decaying_modes_do_not_hide_growing_ones():
-    found = growth(motion(6.0, (3e-4, 20.0, -0.8), (2e-5, 90.0, 1.0)), T, STEP)
-    assert found.trend == "grows"
-    assert found.frequency_hz == pytest.approx(90.0, abs=1.5)  # the spectrum's lines are 1 Hz apart
+    measured = growth(motion(6.0, (3e-4, 20.0, -0.8), (2e-5, 90.0, 1.0)), T, STEP)
+    assert measured.trend == "grows"
+    assert measured.frequency_hz == pytest.approx(90.0, abs=1.5)  # the spectrum's lines are 1 Hz apart
 
 
 def test_a_limit_cycle_neither_grows_nor_decays():
-    found = growth(motion(6.0, (2e-3, 60.0, 0.0)), T, STEP)
-    assert abs(found.growth_rate_per_s) < 1e-3
-    assert found.amplitude_m == pytest.approx(2e-3 * np.hypot(1, 0.5), rel=0.01)  # both channels together
+    measured = growth(motion(6.0, (2e-3, 60.0, 0.0)), T, STEP)
+    assert abs(measured.growth_rate_per_s) < 1e-3
+    assert measured.amplitude_m == pytest.approx(2e-3 * np.hypot(1, 0.5), rel=0.01)  # both channels together
 
 
 def test_displacements_give_the_exact_engines_growth():
@@ -89,8 +89,8 @@ def test_displacements_give_the_exact_engines_growth():
     exact = dominant_mode(close(simulation.plant, simulation.F)).growth
     record = run(simulation, "exact")
     ticks = record.ticks_before_clipping(simulation.process.force_limit)
-    found = growth(record.x[:ticks], T, STEP)
-    assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
+    measured = growth(record.x[:ticks], T, STEP)
+    assert measured.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
 
 
 def test_too_few_ticks_give_a_reason():
@@ -123,7 +123,7 @@ def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
     assert "1/s at 84" in capsys.readouterr().out
 
 
-def made(x, meta):
+def trace_of(x, meta):
     """Return a trace of displacements x with this metadata and without forces."""
     n = len(x)
     unknown = np.full((n, 2), np.nan)
@@ -143,24 +143,24 @@ def made(x, meta):
 )
 def test_a_trace_with_wrong_metadata_is_refused(run_part, words):
     with pytest.raises(InputError, match=words):
-        growths(made(motion(0.6), {"run": run_part}))
+        growths(trace_of(motion(0.6), {"run": run_part}))
 
 
 def test_a_trace_without_steady_ticks_is_one_part():
-    (found,) = growths(made(motion(4.0, (2e-3, 84.0, 1.0)), {"run": None}))
-    assert found.growth_rate_per_s == pytest.approx(1.0, abs=1e-2)
+    (part,) = growths(trace_of(motion(4.0, (2e-3, 84.0, 1.0)), {"run": None}))
+    assert part.growth_rate_per_s == pytest.approx(1.0, abs=1e-2)
 
 
 def test_parts_keep_the_ticks_of_their_trace():
-    (found,) = growths(made(motion(4.0, (2e-3, 84.0, 1.0)), {"run": {"steady_ticks": [[300, 3300]]}}))
-    assert (found.first, found.stop) == (1800, 3300)  # the second half of the part
+    (part,) = growths(trace_of(motion(4.0, (2e-3, 84.0, 1.0)), {"run": {"steady_ticks": [[300, 3300]]}}))
+    assert (part.first, part.stop) == (1800, 3300)  # the second half of the part
 
 
 def test_unusable_traces_and_plot_paths_are_refused(tmp_path):
-    made(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
+    trace_of(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="has no ticks"):
         trace.main([str(tmp_path / "empty.npz")])
-    made(motion(1.0), {}).save_npz(tmp_path / "whole.npz")
+    trace_of(motion(1.0), {}).save_npz(tmp_path / "whole.npz")
     with pytest.raises(InputError, match=r"--plot .*: is a folder, expected a file"):
         trace.main([str(tmp_path / "whole.npz"), "--plot", str(tmp_path)])
     (tmp_path / "text.npz").write_text("no trace")
@@ -189,16 +189,16 @@ def alike():
 def test_unexcited_modes_take_the_exact_verdict(engine):
     """By symmetry the hands, which move alike, do no work on the mode in which the devices move against each other."""
     scenario = alike()
-    quiet = stability_of(*ran(scenario, engine))
+    quiet = stability_of(*simulated(scenario, engine))
     assert quiet.exact_verdict == quiet.verdict == "unstable"
     assert quiet.growth_rate_per_s is None
     assert "not excited" in quiet.reason
-    loud = stability_of(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
+    loud = stability_of(*simulated(scenario.replace(tap=load("omega-pair").tap), engine))
     assert loud.verdict == "unstable"
     assert loud.growth_rate_per_s == pytest.approx(quiet.exact_growth_rate_per_s, rel=1e-2)
 
 
-def ran(scenario, engine):
+def simulated(scenario, engine):
     simulation = assemble(scenario, NoCoupling())
     return simulation, run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
 
@@ -209,17 +209,17 @@ def test_no_trace_contradicts_its_eigenvalues():
 
     `make validate` checks 460 traces.
     """
-    found = list(traces(1, 24))
-    assert [row for row in found if not row.holds] == []
-    assert found[11].not_excited
-    assert found[11].exact_per_s > 100
+    rows = list(traces(1, 24))
+    assert [row for row in rows if not row.holds] == []
+    assert rows[11].not_excited
+    assert rows[11].exact_per_s > 100
     # 8 is a third of the traces.
-    assert sum(row.not_excited for row in found) < 8 < sum(row.exact_per_s > 0 for row in found)
+    assert sum(row.not_excited for row in rows) < 8 < sum(row.exact_per_s > 0 for row in rows)
 
 
 @pytest.mark.parametrize("T", [0.11, 0.25, 0.6, 1.0, 1e3, 1e300])
 def test_too_long_ticks_give_a_reason(T):
     x = np.sin(np.arange(400) / 7)[:, None]
-    found = growth(x, T, np.array([1e-9]))
-    assert found.growth_rate_per_s is None
-    assert "a growth rate needs 0.1 s or less" in found.words(T)
+    measured = growth(x, T, np.array([1e-9]))
+    assert measured.growth_rate_per_s is None
+    assert "a growth rate needs 0.1 s or less" in measured.words(T)

@@ -131,15 +131,15 @@ def test_encoder_steps_move_traces_less_than_a_step():
 def test_long_runs_do_not_drift(minutes):
     """Motions of 0.6 Hz repeat every 12500 ticks of 1.2 ms, so the last period equals one after the first minute."""
     loop = assemble(load().replace(tap=None), PUBLISHED["I"])
-    period, ticks = 12_500, minutes * 50_000
-    outside, rest, kept = partial(outside_forces, loop.scenario, loop.scene), np.zeros((loop.plant.A.shape[0], 1)), {}
+    period, ticks, periods = 12_500, minutes * 50_000, {}
+    outside, rest = partial(outside_forces, loop.scenario, loop.scene), np.zeros((loop.plant.A.shape[0], 1))
 
     def look(buffer, first, count):
         if first in (4 * period, ticks - period):
-            kept[first] = buffer.x[:count].copy()
+            periods[first] = buffer.x[:count].copy()
 
     run_blocks(loop.process, make_engine(loop, "exact"), outside, ticks, rest, look, period)
-    early, late = kept.values()
+    early, late = periods.values()
     drift = np.abs(late - early).max()
     print(f"{minutes} minutes: {drift:.1e} m between the periods after the first minute and at the end")
     assert drift < 1e-12  # [m] rounding

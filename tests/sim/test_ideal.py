@@ -44,14 +44,14 @@ def record_of(simulation: Simulation, seconds: float) -> Trace:
 def test_the_ideal_force_follows_the_measured_motion(case, late):
     simulation = assemble(SCENARIO, PUBLISHED["I"])
     record = record_of(simulation, 2.0)
-    alike = force_error(simulation, record, SCENARIO.loop(case).lam)
+    part = force_error(simulation, record, SCENARIO.loop(case).lam)
     expected = by_hand(SCENARIO.T, record.x, late)
     # The rounding errors of 1700 ticks of a lightly damped mass add up.
-    np.testing.assert_allclose(alike.ideal, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
-    asked = record.f
-    np.testing.assert_allclose(alike.asked, asked, rtol=0, atol=1e-12)  # nothing is clipped here
-    error = np.sqrt(((asked - expected) ** 2).sum() / (expected**2).sum())
-    assert alike.error_percent == pytest.approx(100 * error, rel=1e-6)
+    np.testing.assert_allclose(part.ideal, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    force = record.f
+    np.testing.assert_allclose(part.asked, force, rtol=0, atol=1e-12)  # nothing is clipped here
+    error = np.sqrt(((force - expected) ** 2).sum() / (expected**2).sum())
+    assert part.error_percent == pytest.approx(100 * error, rel=1e-6)
 
 
 def test_responses_equal_impulse_convolution():

@@ -42,8 +42,7 @@ def test_the_limiter_follows_from_the_requirements():
     assert own.rho == pytest.approx((11.4167, 11.4167))
     assert own.requirement is not None
     assert own.requirement.proof == "rational"
-    stiff = STIFF
-    refused = _covered_limits(loop, stiff, requirements_of(loop, stiff))
+    refused = _covered_limits(loop, STIFF, requirements_of(loop, STIFF))
     assert refused.rho is None
     assert "needs 1.385" in refused.reason
 
@@ -54,14 +53,14 @@ def test_limiters_use_the_beta_of_the_file(tmp_path):
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
     save(Stored.of(loop, BUILT, proof), path)
-    found = assessed(scenario, "I", choose(scenario, "I", str(path))).force_limits
-    assert found.certificate == proof
-    assert (found.rho, found.c, found.proved) == (
+    limits = assessed(scenario, "I", choose(scenario, "I", str(path))).force_limits
+    assert limits.certificate == proof
+    assert (limits.rho, limits.c, limits.proved) == (
         proof.multipliers["rho"],
         tuple((c,) for c in proof.multipliers["c"]),
         True,
     )
-    assert found.rho == pytest.approx((34.25, 34.25))
+    assert limits.rho == pytest.approx((34.25, 34.25))
     devices = tuple(msgspec.structs.replace(device, damping=1.5) for device in scenario.device)
     stronger = scenario.replace(device=devices)
     assert assessed(stronger, "I", choose(stronger, "I", str(path))).force_limits.rho == pytest.approx((37.5, 37.5))
@@ -90,18 +89,18 @@ def test_runs_in_blocks_equal_runs_by_ticks(engine, apart, limit):
     simulation = assemble(weak(limit, limit).replace(duration=3.0), BUILT, (11.4167, 11.4167))
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
     fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))
-    found, expected = run(simulation, fast), run(simulation, tick_by_tick(slow))
+    blocks, expected = run(simulation, fast), run(simulation, tick_by_tick(slow))
     assert vars(fast)["run_block"] is not None
     assert (0 < expected.clipped(np.array([limit] * 2)).mean() < 0.2) == (limit < 10)
     for name in ("s", "z", "f", "w"):
         rows = getattr(expected, name)
-        np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
+        np.testing.assert_allclose(getattr(blocks, name), rows, rtol=0, atol=apart * np.abs(rows).max())
 
 
 def test_a_single_block_applies_every_outside_force():
     simulation = assemble(weak(1e3, 1e3).replace(duration=0.1), BUILT, (11.4167, 11.4167))
-    found, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
-    np.testing.assert_allclose(found.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())
+    block, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
+    np.testing.assert_allclose(block.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())
 
 
 def test_limited_and_clipped_runs_agree_below_limits():

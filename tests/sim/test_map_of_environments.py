@@ -77,9 +77,9 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, K, B, optimal):
     def filtered(z, E):
         return coupling.filter(scenario.T).at(z) @ E
 
-    found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
-    assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
-    assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
+    ratio = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
+    assert ratio == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
+    assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(ratio, rel=1e-6)
 
 
 def test_a_kept_model_is_the_scenarios_environment():

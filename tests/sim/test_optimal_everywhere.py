@@ -51,18 +51,18 @@ def file_of(tmp_path_factory):
     folder = tmp_path_factory.mktemp("optimal")
 
     @cache
-    def made(form):
+    def stored(form):
         name = str(FREE_MASS) if form == "delayed" else "omega-pair"
         scenario, path = load(name), folder / f"{form}.json"
         loop = scenario.loop("I")
         if form == "pair":
             save(Stored.of(loop, VERTICES_ONLY, prove(loop, VERTICES_ONLY, "this-environment")), path)
         else:
-            found = design(loop, Options(bases=SMALL, limiter=form == "filter"))
-            save(Stored.of(loop, found.coupling, found.certificate), path)
+            optimum = design(loop, Options(bases=SMALL, limiter=form == "filter"))
+            save(Stored.of(loop, optimum.coupling, optimum.certificate), path)
         return scenario, name, path
 
-    return made
+    return stored
 
 
 @pytest.mark.slow
@@ -93,8 +93,8 @@ def test_coupling_files_prove_and_drive_the_process(file_of, form):
 def test_run_and_validate_take_couplings_of_each_form(file_of, form, tmp_path):
     _, name, path = file_of(form)
     common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
-    asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]
-    assert run.main(asked) == 0
+    options = [*common, "--duration", "0.2", "--out", str(tmp_path)]
+    assert run.main(options) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["robustness"]["percent"] == 10
@@ -125,9 +125,9 @@ def test_exports_repeat_to_the_last_bit(file_of, form, tmp_path):
     assert export.main([str(file_of(form)[2]), "--process", *limit, "--out", str(out)]) == 0
     built = [str(CC), "-std=c99", "-ffp-contract=off", "-DHAPTIC_LOOP_TEST", str(out), "-o", str(tmp_path / "p"), "-lm"]
     subprocess.run(built, check=True)
-    done = subprocess.run([tmp_path / "p"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    assert "64 ticks" in done.stdout
+    process = subprocess.run([tmp_path / "p"], capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout
+    assert "64 ticks" in process.stdout
 
 
 class _Never(Executor):

@@ -143,12 +143,12 @@ def test_friction_with_an_impedance_needs_runge_kutta():
 
 @pytest.mark.slow
 def test_impedance_populations_agree_in_both_engines():
-    found = validate(held_by(Light(), Light()).replace(population=Muscles(Light)), None, humans=10, duration=0.3)
-    assert 0 < (found.exact > 0).sum() < 10
-    assert not found.disagreements.any()
+    findings = validate(held_by(Light(), Light()).replace(population=Muscles(Light)), None, humans=10, duration=0.3)
+    assert 0 < (findings.exact > 0).sum() < 10
+    assert not findings.disagreements.any()
     # RK4 gives the rates `mujoco`: when measured, they were within 3e-4 1/s.
-    np.testing.assert_allclose(found.mujoco, found.exact, atol=2e-2, rtol=1e-3)
-    np.testing.assert_allclose(found.trace, found.exact, atol=2e-2, rtol=1e-3)
+    np.testing.assert_allclose(findings.mujoco, findings.exact, atol=2e-2, rtol=1e-3)
+    np.testing.assert_allclose(findings.trace, findings.exact, atol=2e-2, rtol=1e-3)
 
 
 @dataclass(frozen=True)
@@ -165,20 +165,20 @@ class Muscles:
 def test_own_hand_populations_agree_in_both_engines():
     """Without coupling some hands make the loop unstable; both engines agree which, and a repetition gives the same."""
     scenario = SCENARIO.replace(population=Muscles())
-    found = validate(scenario, None, humans=40, duration=0.5)
-    assert 0 < (found.exact > 0).sum() < 40
-    assert not found.disagreements.any()
+    findings = validate(scenario, None, humans=40, duration=0.5)
+    assert 0 < (findings.exact > 0).sum() < 40
+    assert not findings.disagreements.any()
     # RK4 gives the rates `mujoco`: when measured, they were within 4e-4 1/s.
-    np.testing.assert_allclose(found.mujoco, found.exact, atol=2e-2, rtol=1e-3)
+    np.testing.assert_allclose(findings.mujoco, findings.exact, atol=2e-2, rtol=1e-3)
     contradicted, question = (
-        replace(found, mujoco=-found.exact),
+        replace(findings, mujoco=-findings.exact),
         Validation(scenario, NoCoupling(), 0, 40, 1, "both", 0.5),
     )
-    assert "replay" not in disagreement_words(question, contradicted)  # No file holds these hands.
+    assert "repeat" not in disagreement_words(question, contradicted)  # No file can store these hands.
     again = validate(scenario, None, humans=10, duration=0.0, engine="exact")
-    np.testing.assert_array_equal(again.exact, found.exact[:10])
-    assert found.mass.shape == (40,)
-    assert (found.damping == 0).all()  # the series spring has no damper
+    np.testing.assert_array_equal(again.exact, findings.exact[:10])
+    assert findings.mass.shape == (40,)
+    assert (findings.damping == 0).all()  # the series spring has no damper
 
 
 @pytest.mark.slow
@@ -250,20 +250,20 @@ def test_the_adversary_takes_a_population_file(tmp_path):
     ]
     words += ["--adversary", "--generations", "3", "--out", str(tmp_path / "out"), "--json", str(report)]
     assert validate_command(words) == 0
-    found = json.loads(report.read_text())["adversary_population"]
-    assert found["found"]
-    assert found["evaluated"] == 360  # three generations of 120 sets
-    assert [human["class"] for human in found["human"]] == ["Grip", "Grip"]
+    worst = json.loads(report.read_text())["adversary_population"]
+    assert worst["found"]
+    assert worst["evaluated"] == 360  # three generations of 120 sets
+    assert [human["class"] for human in worst["human"]] == ["Grip", "Grip"]
 
 
 def test_population_verdicts_equal_those_of_single_hands():
     scenario = SCENARIO.replace(population=Muscles(Light))
-    found = validate(scenario, PUBLISHED["I"], humans=6, duration=0.0, engine="exact")
+    findings = validate(scenario, PUBLISHED["I"], humans=6, duration=0.0, engine="exact")
     for i in (0, 5):
         hands = Validation(scenario, PUBLISHED["I"], 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
         simulation = assemble(scenario.replace(human=hands), PUBLISHED["I"])
-        assert found.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
-        assert found.mass[i] == pytest.approx(np.sqrt(hands[0].mass * hands[1].mass))
+        assert findings.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
+        assert findings.mass[i] == pytest.approx(np.sqrt(hands[0].mass * hands[1].mass))
 
 
 def test_a_person_may_hold_with_own_hands():
@@ -351,16 +351,16 @@ def test_engines_agree_on_a_population_at_walls():
     """The engines agree, traces touch the wall and give no energy, and a hand's growth is that of its worst contact."""
     scenario = load("one-wall")
     coupling = design_coupling(scenario.loop("I"), "spring-damper", "any-environment")
-    found = validate(scenario, coupling, humans=20, duration=2.0)
-    assert (found.exact < 0).all()
-    assert not found.disagreements.any()
-    assert found.contacts.sum() > 10
-    assert (found.energy >= -1e-9 * found.audited).all()
+    findings = validate(scenario, coupling, humans=20, duration=2.0)
+    assert (findings.exact < 0).all()
+    assert not findings.disagreements.any()
+    assert findings.contacts.sum() > 10
+    assert (findings.energy >= -1e-9 * findings.audited).all()
     # The growth is the larger growth of the open and the touching loop with this human.
     simulation = assemble(scenario, coupling.coupling)
     crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
     plant = hold(variants(scenario.device, crowd).plants(), scenario.T)
     states = simulation.process.law.frozen().values()
     growth = max(float(dominant_mode(close(plant, F)).growth[0]) for F in states)
-    assert found.exact[7] == pytest.approx(growth, rel=1e-9)
+    assert findings.exact[7] == pytest.approx(growth, rel=1e-9)
     assert (validate(scenario, None, humans=20, duration=0.0).exact > 0).any()

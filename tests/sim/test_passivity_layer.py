@@ -33,7 +33,7 @@ def stiffer(scenario, factor):
     return scenario.replace(environment=msgspec.structs.replace(network, springs=springs))
 
 
-def given(simulation, trace):
+def energy_given(simulation, trace):
     """Return the largest energy [J] given to hands up to any tick: forces' work less the devices' least dissipation."""
     s, dx = trace.s[:, : simulation.process.channels], np.diff(trace.s[:, : simulation.process.channels], axis=0)
     assert len(s) == len(trace.f)
@@ -149,11 +149,11 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
     part = trace.net.figures()
     assert part.limited_ticks > 100
     assert part.surprises == 0
-    assert given(guarded, trace) <= start + 1e-9
+    assert energy_given(guarded, trace) <= start + 1e-9
     assert (part.dropped_ticks > 0) == vary
     if not vary:
         alone = run(simulation, "exact")
-        assert given(simulation, alone) > 0.1
+        assert energy_given(simulation, alone) > 0.1
         assert np.abs(trace.f).max() < 0.5 * np.abs(alone.f).max()
 
 
@@ -167,7 +167,7 @@ def test_budgets_bound_loops_with_walls():
     )
     assert np.abs(alone.f).max() > 0.1
     assert np.abs(rich.f - alone.f).max() < 1e-9
-    assert given(simulation, poor) <= 1e-9
+    assert energy_given(simulation, poor) <= 1e-9
 
 
 @pytest.mark.slow
@@ -189,7 +189,7 @@ def test_the_shell_bounds_a_users_environment():
     for start in (0.002, 1e9):
         simulation = assemble(SHORT, coupling)
         trace = run(netted(simulation, Plugged(thief(), start)), "exact")
-        energies[start] = given(simulation, trace)
+        energies[start] = energy_given(simulation, trace)
         assert trace.net.figures().limited_ticks > 100 or start > 1
     assert V is not None
     assert energies[0.002] <= 0.002

@@ -79,9 +79,9 @@ def test_pictures_contain_every_sample(drawn):
     f = steps.cumsum(axis=0)  # Sharp turns in the first ticks give the picture a zoom.
     f[:, 1] = 0.01 * np.arange(1200)  # the calm channel is drawn last, so that it stays visible
     figure = plots.draw_run(trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
-    whole = lines(figure.axes[2])
+    curves = lines(figure.axes[2])
     for i in range(3):
-        np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
+        np.testing.assert_array_equal(curves[f"device {i + 1}"][:, 1], f[:, i])
         mm = lines(figure.axes[0])[f"device {i + 1}"][:, 1]
         np.testing.assert_allclose(mm, f[:, i], rtol=1e-12)  # x in mm equals f
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
@@ -233,7 +233,7 @@ def k_b_map():
     return SimpleNamespace(grid=SimpleNamespace(B=B, K=K, scale="linear", shape=(2, 3)), growth=growth, ratio=ratio)
 
 
-def told(**changes):
+def map_report(**changes):
     """Return the report of a map with three simulated points; `changes` replace its fields."""
 
     def point(B, K, verdict, differs=False):
@@ -253,7 +253,7 @@ def told(**changes):
 
 
 def test_a_map_shows_verdicts_edges_and_points(drawn):
-    figure = drawn(map_plot.plot_zwidth, k_b_map(), told())
+    figure = drawn(map_plot.plot_zwidth, k_b_map(), map_report())
     (axis,) = figure.axes
     cells = axis.collections[0].get_array()
     np.testing.assert_array_equal(cells.mask.ravel(), [False] * 4 + [True, False])
@@ -300,8 +300,8 @@ def test_panels_show_forces_beside_ideal_ones(undrawn):
 def test_environment_maps_mark_their_design_point(drawn):
     springs = [SimpleNamespace(B=1.0, K=15.0), SimpleNamespace(B=9.0, K=15.0)]
     fixed = SimpleNamespace(kind="spring-damper", contact_springs=springs)
-    empty = SimpleNamespace(points=[], effects=told().simulation.effects, nonlinear=False)
-    figure = drawn(map_plot.plot_zwidth, k_b_map(), told(fixed=fixed, simulation=empty))
+    empty = SimpleNamespace(points=[], effects=map_report().simulation.effects, nonlinear=False)
+    figure = drawn(map_plot.plot_zwidth, k_b_map(), map_report(fixed=fixed, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other spring is not on the map
     assert "this environment: certified inside this edge" in legend(figure)
@@ -310,7 +310,7 @@ def test_environment_maps_mark_their_design_point(drawn):
 def test_legends_say_where_maps_are_certified(drawn):
     stiffer = k_b_map()
     stiffer.ratio = {"any-environment": np.array([2, 2, 2, 0.5, 2, 2.0])}
-    figure = drawn(map_plot.plot_zwidth, stiffer, told(psi=[0, 0]))
+    figure = drawn(map_plot.plot_zwidth, stiffer, map_report(psi=[0, 0]))
     assert "any passive environment: certified above this edge" in legend(figure)
 
 

@@ -76,12 +76,12 @@ device = ["omega.3", "omega.3"]
 contacts = ["a", "b"]
 springs = [{ between = ["a", "b"], stiffness = 200.0 }]
 """
-    made = parse(bare)
-    assert made.psi == (0, 0)
-    hands = [human.voluntary.phase for human in made.human]
-    assert hands == [0.0, np.pi / 2], "the hands must move apart, so that they feel the spring"
-    assert made.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
-    assert made.replace(theta=(1, 1)).human == made.human
+    scenario = parse(bare)
+    assert scenario.psi == (0, 0)
+    phases = [human.voluntary.phase for human in scenario.human]
+    assert phases == [0.0, np.pi / 2], "the hands must move apart, so that they feel the spring"
+    assert scenario.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
+    assert scenario.replace(theta=(1, 1)).human == scenario.human
     for empty, expected in (
         ("psi", "but the environment has 2 contacts"),
         ("human", "expected 2, one for each device"),

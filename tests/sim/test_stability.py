@@ -100,10 +100,10 @@ def test_short_traces_do_not_contradict_eigenvalues():
     lead = np.argmax(np.abs(values))
     grown = (values[lead] / np.abs(values[lead])) ** np.arange(len(trace.t)) * np.exp(trace.t)
     s, z = np.split((grown[:, None] * vectors[:, lead]).real, [trace.s.shape[1]], axis=1)
-    told = stability_of(simulation, replace(trace, s=s, z=z, w=0 * trace.w))
-    assert told.growth_rate_per_s == pytest.approx(1.0, abs=1e-6)
-    assert told.verdict == told.exact_verdict == "stable"
-    assert told.reason.startswith("not decidable in 0.5")
+    stability = stability_of(simulation, replace(trace, s=s, z=z, w=0 * trace.w))
+    assert stability.growth_rate_per_s == pytest.approx(1.0, abs=1e-6)
+    assert stability.verdict == stability.exact_verdict == "stable"
+    assert stability.reason.startswith("not decidable in 0.5")
 
 
 def test_free_hands_settle_by_their_speed():
@@ -123,9 +123,9 @@ def test_figures_of_an_impulse_follow_from_its_trace():
     late = Network(("a",), (Spring(("a", GROUND), 2000.0),))
     scenario = load("one-wall").replace(environment=late, theta=(2,), tap=None)
     question = Validation(scenario, NoCoupling(), 0, 3, 1, "exact", 0.25)
-    found = _examine(question, range(3))
-    assert (found.energy < 0).any()
-    assert (found.trace_error > 3.99 / 0.25).all()  # a trace decides a sign after four time constants
+    findings = _examine(question, range(3))
+    assert (findings.energy < 0).any()
+    assert (findings.trace_error > 3.99 / 0.25).all()  # a trace decides a sign after four time constants
     for i in range(3):
         simulation = assemble(scenario.replace(human=question.crowd(i).humans(0)), NoCoupling())
         knock = partial(impulse_forces, simulation.scene, simulation.scenario.T)
@@ -133,19 +133,19 @@ def test_figures_of_an_impulse_follow_from_its_trace():
         dx = np.diff(trace.x, axis=0)
         terms = trace.f[:-1] * dx + np.array(simulation.scenario.delta) / simulation.scenario.T * dx**2
         least = terms.sum(axis=1).cumsum().min(initial=0.0)
-        assert found.energy[i] == pytest.approx(least, abs=1e-12 * found.audited[i])
+        assert findings.energy[i] == pytest.approx(least, abs=1e-12 * findings.audited[i])
         n, speed = question.ticks, trace.v_handle
         early, last = np.linalg.norm(speed[n // 4 : n // 2]), np.linalg.norm(speed[n - n // 4 : n])
-        assert found.settling[i] == pytest.approx(last / early, rel=1e-9)
+        assert findings.settling[i] == pytest.approx(last / early, rel=1e-9)
 
 
 def test_diverged_runs_are_unstable():
     simulation = assemble(load().replace(duration=0.3), PUBLISHED["I"])
     trace = run(simulation, "exact")
     assert stability_of(simulation, trace).verdict == "stable"
-    told = stability_of(simulation, replace(trace, diverged=True))
-    assert told.verdict == "unstable"
-    assert "left the range of finite numbers" in told.reason
+    stability = stability_of(simulation, replace(trace, diverged=True))
+    assert stability.verdict == "unstable"
+    assert "left the range of finite numbers" in stability.reason
 
 
 def test_contact_at_the_beginning_is_counted():
@@ -189,21 +189,21 @@ def knocked(K):
 def test_ringing_equals_poles_of_the_held_plant():
     """Device and hand are one body on a spring; the poles come from matrices that are written out here."""
     pair = knocked(900.0)
-    said = ringing(assemble(parse(KNOCK + "springs" + SPRING), NoCoupling()))
-    assert said.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
-    assert said.frequency_hz == pytest.approx(abs(pair.imag) / (2 * np.pi), rel=1e-9)
-    assert said.words.startswith("decays ")
-    assert replace(said, decay_per_s=-1.5).words.startswith("grows 1.5 1/s at ")
-    assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
+    decay = ringing(assemble(parse(KNOCK + "springs" + SPRING), NoCoupling()))
+    assert decay.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
+    assert decay.frequency_hz == pytest.approx(abs(pair.imag) / (2 * np.pi), rel=1e-9)
+    assert decay.words.startswith("decays ")
+    assert replace(decay, decay_per_s=-1.5).words.startswith("grows 1.5 1/s at ")
+    assert decay.damping_ratio == decay.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
 
 
 def test_ringing_is_that_of_the_slowest_contact():
     """A wall is a spring or nothing; here the touching loop decays more slowly and has the least damping ratio."""
     away, held = knocked(0.0), knocked(900.0)
     assert away.real < held.real
-    said = ringing(assemble(parse(KNOCK + "walls" + SPRING), NoCoupling()))
-    assert said.decay_per_s == pytest.approx(-held.real, rel=1e-9)
-    assert said.least_damping_ratio == pytest.approx(-held.real / abs(held), rel=1e-9)
+    decay = ringing(assemble(parse(KNOCK + "walls" + SPRING), NoCoupling()))
+    assert decay.decay_per_s == pytest.approx(-held.real, rel=1e-9)
+    assert decay.least_damping_ratio == pytest.approx(-held.real / abs(held), rel=1e-9)
 
 
 def test_free_drifts_have_no_ringing():

@@ -312,15 +312,16 @@ def test_a_lost_packet_holds_the_last_force():
 def test_own_or_worst_delays_decide_instability(own, worst):
     met = _DelaysMet(None, [0, 0], [0, 0], 0.5, own, 4.0, _PeriodGrowth(3, -0.5, 0.9, worst))
     trace = close_loop(ASSEMBLY, "exact", ticks=20)
-    told = switched_stability(ASSEMBLY, trace, VaryingDelays(DelaySpan((1,), (2,), "", 0, False, False), met, None))
-    assert told.verdict == ("unstable" if "unstable" in (own, worst) else "stable")
+    delays = VaryingDelays(DelaySpan((1,), (2,), "", 0, False, False), met, None)
+    verdict = switched_stability(ASSEMBLY, trace, delays).verdict
+    assert verdict == ("unstable" if "unstable" in (own, worst) else "stable")
 
 
 def test_constant_delays_of_uncertified_loops_are_uncovered():
     scenario = load().replace(varying_delay=VaryingDelay((1, 2), (1, 2)))
-    found = DelaysCovered.of(scenario, assess(scenario.loop("I"), NoCoupling()))
-    assert not found.covered
-    assert "nothing is certified" in found.covers
+    delays = DelaysCovered.of(scenario, assess(scenario.loop("I"), NoCoupling()))
+    assert not delays.covered
+    assert "nothing is certified" in delays.covers
 
 
 def test_the_felt_force_includes_constant_delays():

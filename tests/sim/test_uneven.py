@@ -60,9 +60,9 @@ def by_hand(simulation, ticks):
         now = 0.0
         for until in sorted({*late.tolist(), T} - {0.0}):
             acts = np.where(late <= now, force, held)
-            whole = np.zeros((n + w + m, n + w + m))
-            whole[:n, :n], whole[:n, n:] = P.A, P.B
-            s = (expm(whole * (until - now)) @ np.concatenate([s, pushed[k], acts]))[:n]
+            generator = np.zeros((n + w + m, n + w + m))
+            generator[:n, :n], generator[:n, n:] = P.A, P.B
+            s = (expm(generator * (until - now)) @ np.concatenate([s, pushed[k], acts]))[:n]
             now = until
         held = force
     return np.array(states)
@@ -111,9 +111,9 @@ def test_late_loops_match_their_map():
     simulation = assemble(PAIR.replace(latency=((tau, tau),) * 2), SOFT)
     P, m, F = plant(simulation.scene.model), 2, simulation.F
     n, T = len(P.A), PAIR.T
-    whole = np.zeros((n + m, n + m))
-    whole[:n, :n], whole[:n, n:] = P.A, P.B[:, -m:]
-    early, later = expm(whole * tau)[:n], expm(whole * (T - tau))[:n]
+    generator = np.zeros((n + m, n + m))
+    generator[:n, :n], generator[:n, n:] = P.A, P.B[:, -m:]
+    early, later = expm(generator * tau)[:n], expm(generator * (T - tau))[:n]
     A = np.zeros((n + m + F.order,) * 2)
     force = np.hstack([F.D @ P.C, np.zeros((m, m)), F.C])
     A[:n, :n], A[:n, n : n + m] = later[:, :n] @ early[:, :n], later[:, :n] @ early[:, n:]
@@ -139,7 +139,7 @@ def test_drawn_tick_times_are_in_range_and_seeded():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"period": {"min": 1e-3}}, r"period\.min, period\.max are 0\.001 s, none"),
         ({"period": {"min": 1e-3, "max": 2e-3, "recorded": [1e-3]}}, "either min and max, or recorded"),
@@ -149,8 +149,8 @@ def test_drawn_tick_times_are_in_range_and_seeded():
         ({"T_min": 2e-4, "T_max": 2e-3, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
     ],
 )
-def test_impossible_tick_times_are_refused(changes, said):
-    with pytest.raises(InputError, match=said):
+def test_impossible_tick_times_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         PAIR.replace(**changes)
 
 
@@ -198,16 +198,16 @@ def test_growth_of_uneven_ticks_agrees_with_the_eigenvalues():
     springs = (Spring(("a", "m"), 397.7, 0.0), Spring(("b", "m"), 23.85, 0.2625), Spring(("c", "m"), 911.5, 0.2725))
     nearly_even = {"period": Periods(0.99e-3, 1.01e-3), "theta": (1, 1, 4), "T_max": 1.1e-3}
     scenario = load("three-rigid").replace(environment=Network(tuple("abc"), springs, {"m": 1.227}), **nearly_even)
-    found = _examine(Validation(scenario, NoCoupling(), 0, 60, 1, "exact", 2.0), range(60))
-    clear = np.abs(found.exact) > 0.05
-    assert {True, False} == set((found.exact[clear] > 0).tolist())
-    np.testing.assert_array_equal(found.switching[clear] > 0, found.exact[clear] > 0)
+    findings = _examine(Validation(scenario, NoCoupling(), 0, 60, 1, "exact", 2.0), range(60))
+    clear = np.abs(findings.exact) > 0.05
+    assert {True, False} == set((findings.exact[clear] > 0).tolist())
+    np.testing.assert_array_equal(findings.switching[clear] > 0, findings.exact[clear] > 0)
 
     simulation = assemble(scenario.replace(duration=0.3), NoCoupling())
-    told = stability_of(simulation, run(simulation, "exact"))
-    assert told.verdict == told.exact_verdict == "unstable"
+    stability = stability_of(simulation, run(simulation, "exact"))
+    assert stability.verdict == stability.exact_verdict == "unstable"
     # Periods that vary by 1 % change the growth a little.
-    assert told.growth_rate_per_s == pytest.approx(told.exact_growth_rate_per_s, abs=0.05)
+    assert stability.growth_rate_per_s == pytest.approx(stability.exact_growth_rate_per_s, abs=0.05)
 
 
 def test_slow_rates_have_no_verdict():
@@ -221,10 +221,10 @@ def test_slow_creep_is_undecided():
     changes = {"device": (RigidDevice(damping=1.37),), "human": (human,), "tap": None, "environment": spring}
     scenario = load("one-wall").replace(T=0.02, theta=(1,), period=Periods(0.018, 0.02), duration=1.0, **changes)
     simulation = assemble(scenario, NoCoupling())
-    found = stability_of(simulation, run(simulation, "exact"))
-    assert found.verdict is None
-    assert "not decidable" in found.reason
-    assert found.growth_rate_per_s == pytest.approx(-0.011 / 4.37, rel=1e-3)
+    stability = stability_of(simulation, run(simulation, "exact"))
+    assert stability.verdict is None
+    assert "not decidable" in stability.reason
+    assert stability.growth_rate_per_s == pytest.approx(-0.011 / 4.37, rel=1e-3)
 
 
 def test_periods_and_delays_may_vary_together():
@@ -239,7 +239,7 @@ def test_periods_and_delays_may_vary_together():
 
 @pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
-    """This is a short form of the check in `make validate`, which must fail with half the required damping."""
+    """A short form of the check in `make validate` holds, and fails with half the required damping."""
     rows = list(uneven.uneven_ticks(0, 3, 500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
@@ -257,9 +257,9 @@ def test_latch_positions_follow_the_plants_motion():
     s, held, w, f = (rng.normal(size=size) for size in (4, 2, 1, 2))
 
     def moved(s, force, t):
-        whole = np.zeros((7, 7))
-        whole[:4, :4], whole[:4, 4:] = A, B
-        return (expm(whole * t) @ np.concatenate([s, w, force]))[:4]
+        generator = np.zeros((7, 7))
+        generator[:4, :4], generator[:4, 4:] = A, B
+        return (expm(generator * t) @ np.concatenate([s, w, force]))[:4]
 
     first = moved(s, held, 1e-4)
     second = moved(first, [held[0], f[1]], 2e-4)
@@ -303,10 +303,10 @@ def test_late_balances_count_the_simulated_spans():
 def test_both_engines_trace_late_forces():
     wall = Network(("a",), (Spring(("a", GROUND), 900.0),))
     late = load("one-wall").replace(environment=wall, latency=((3e-4, 3e-4),), tap=None)
-    found = _examine(Validation(late, NoCoupling(), 0, 2, 1, "both", 0.25), range(2))
-    assert found.witnessed.all()
-    np.testing.assert_allclose(found.trace, found.exact, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.mujoco, found.exact, rtol=0, atol=1e-3)  # MuJoCo steps by RK4 here
+    findings = _examine(Validation(late, NoCoupling(), 0, 2, 1, "both", 0.25), range(2))
+    assert findings.witnessed.all()
+    np.testing.assert_allclose(findings.trace, findings.exact, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(findings.mujoco, findings.exact, rtol=0, atol=1e-3)  # MuJoCo steps by RK4 here
 
 
 @pytest.mark.slow
@@ -314,10 +314,10 @@ def test_the_energy_audit_sees_late_forces():
     """With a certified coupling no loop gives energy; without coupling some do, and all of these are unstable."""
     late = PAIR.replace(latency=LATE)
     for coupling, gives in ((SOFT, False), (NoCoupling(), True)):
-        found = _examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))
-        gave = found.energy < -1e-9 * found.audited
+        findings = _examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))
+        gave = findings.energy < -1e-9 * findings.audited
         assert gave.any() == gives
-        assert (found.exact[gave] > 0).all()
+        assert (findings.exact[gave] > 0).all()
 
 
 def test_the_energy_audit_agrees_with_ranges_of_latency():
@@ -326,8 +326,8 @@ def test_the_energy_audit_agrees_with_ranges_of_latency():
     fields = {"theta": (1,), "psi": (0,), "device": (device,), "human": PAIR.human[:1], "environment": spring}
     late = PAIR.replace(T=1.2e-3, latency=((0.0, 0.48e-3),), tap=None, **fields)
     assert required_damping(late.loop("I"), NoCoupling(), "this-environment").certified
-    found = _examine(Validation(late, NoCoupling(), 0, 12, 1, "exact", 1.0), range(12))
-    assert (found.energy >= -1e-9 * found.audited).all()
+    findings = _examine(Validation(late, NoCoupling(), 0, 12, 1, "exact", 1.0), range(12))
+    assert (findings.energy >= -1e-9 * findings.audited).all()
 
 
 @pytest.mark.parametrize("timed", [True, False])
@@ -340,8 +340,8 @@ def test_no_reference_cycle_keeps_an_engine(integrator, timed):
         for make, scene in ((MujocoEngine, simulation.scene), (MujocoBatchEngine, alike(simulation.scene, 1))):
             engine = make(scene, simulation.scenario.T, integrator, timing=simulation.timing)
             run(simulation, engine, ticks=3)
-            kept = weakref.ref(engine._access)  # this object holds MuJoCo's memory
+            memory = weakref.ref(engine._access)  # this object holds MuJoCo's memory
             del engine
-            assert kept() is None
+            assert memory() is None
     finally:
         gc.enable()

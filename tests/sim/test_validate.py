@@ -81,12 +81,12 @@ KNOWN = load("omega-pair-known")
 def test_drawn_devices_are_within_their_bounds(engine):
     """The growth rate of each drawn pair of devices equals that of a scene built with this pair."""
     question = Validation(KNOWN, NoCoupling(), 5, 40, MIXED, engine, 0.0)
-    found, F = validate(question), assemble(KNOWN, NoCoupling()).F
+    findings, F = validate(question), assemble(KNOWN, NoCoupling()).F
     for index, people in question.crowds(range(8)):
         for i, own in enumerate(people.mechanics):
             devices = [drawn.of(device) for drawn, device in zip(own, KNOWN.device, strict=True)]  # checks the bounds
             alone = dominant_mode(close(hold(plant(build(devices, people.humans(i)).model), KNOWN.T), F))
-            growth = found.exact if engine == "exact" else found.mujoco
+            growth = findings.exact if engine == "exact" else findings.mujoco
             # When measured, RK4 erred by 6e-5 1/s.
             assert growth[index[i]] == pytest.approx(alone.growth, abs=1e-9 if engine == "exact" else 1e-3)
     masses = np.array([one.motor_mass for i in range(40) for one in question.crowd(i).mechanics[0]])
@@ -111,7 +111,7 @@ def test_no_hand_makes_known_devices_unstable(tmp_path, humans):
     assert radius == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
 
 
-def asked(scenario):
+def question_of(scenario):
     return Validation(scenario, PUBLISHED["I"], 7, 20, 2, "exact", 0.0)
 
 
@@ -122,7 +122,7 @@ HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 def test_stacked_people_equal_single_ones(devices):
     """Each person of a crowd has the plant of the person's own scene, and MuJoCo's map agrees with the exact one."""
     scenario = HELD.replace(device=devices)
-    ((_, people),) = asked(scenario).crowds(range(20))
+    ((_, people),) = question_of(scenario).crowds(range(20))
     held_by = variants(devices, people)
     stacked = held_by.plants()
     for i in range(5):
@@ -135,7 +135,7 @@ def test_stacked_people_equal_single_ones(devices):
     # When measured, RK4 erred by 2e-4 1/s.
     np.testing.assert_allclose(dominant_mode(close(plants, simulation.F)).growth, exact, rtol=0, atol=1e-3)
     # The arms equal those of people who hold one device each.
-    np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
+    np.testing.assert_array_equal(people.links, next(question_of(SCENARIO).crowds(range(20)))[1].links)
 
 
 def test_both_engines_agree_on_a_person():
@@ -390,20 +390,20 @@ def test_ctrl_c_ends_other_processes_batches():
     before = set(multiprocessing.active_children())
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
-    found = validate(question, shards=2)
+    findings = validate(question, shards=2)
     timer.join()
-    assert found.interrupted
-    assert found.index.size == 0
+    assert findings.interrupted
+    assert findings.index.size == 0
     assert set(multiprocessing.active_children()) <= before
 
 
 def test_restless_short_traces_give_no_verdict():
     """Settling decides only on traces that are long compared with the slowest decay of the same humans."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", 0.5)
-    found = validate(question)
+    findings = validate(question)
     for duration in (0.5, 40.0):
-        traces = Traces.of(replace(question, duration=duration), found)
-        assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
+        traces = Traces.of(replace(question, duration=duration), findings)
+        assert traces.slowest_decay_s == pytest.approx(-1 / findings.exact.max())
         assert traces.settling_decides == (traces.reason is None) == (duration > 30)
 
 
@@ -421,33 +421,33 @@ def four():
         "switching": [-1.0, 3.0, 2.0, np.nan],
         "switching_mujoco": [np.nan, 1.0, -1.0, np.nan],
     }
-    found = validate(replace(question, engine="exact", duration=0.0))
-    return question, replace(found, **{name: np.array(values) for name, values in columns.items()})
+    findings = validate(replace(question, engine="exact", duration=0.0))
+    return question, replace(findings, **{name: np.array(values) for name, values in columns.items()})
 
 
 def test_energy_audits_leave_out_clipped_traces(four):
-    question, found = four
-    audit = EnergyAudit.of(question, found)
+    question, findings = four
+    audit = EnergyAudit.of(question, findings)
     assert (audit.audited, audit.clipped, audit.violated, audit.least_J, audit.holds) == (3, 1, 1, -1.0, False)
-    limited = EnergyAudit.of(replace(question, lag=(0.0, 0.0)), found)  # the account covers a limiter
+    limited = EnergyAudit.of(replace(question, lag=(0.0, 0.0)), findings)  # the account covers a limiter
     assert (limited.audited, limited.violated, limited.least_J) == (4, 2, -4.0)
 
 
 def test_verdicts_name_the_worst_hands(four):
-    question, found = four
-    worst, traces = WorstDrawn.of(question, found), Traces.of(question, found)
+    question, findings = four
+    worst, traces = WorstDrawn.of(question, findings), Traces.of(question, findings)
     assert (worst.growth_rate_per_s, worst.who.index) == (2.0, 2)
     assert (traces.stable, traces.stable_and_settling, traces.slowest_settling) == (3, 2, 1.5)
     assert (traces.clipped_runs, traces.slowest_decay_s) == (1, 2.0)
-    covered, not_covered = (Growing.of(question, found, None, covered) for covered in (True, False))
+    covered, not_covered = (Growing.of(question, findings, None, covered) for covered in (True, False))
     assert (covered.unstable.exact, covered.unstable.mujoco, covered.humans, covered.mujoco_unclipped) == (2, 1, 3, 2)
     assert (covered.largest_growth_per_s, covered.worst_index) == (3.0, 1)
     assert (covered.holds, not_covered.holds) == (False, True)
 
 
 def test_adversaries_contradict_certificates_only():
-    found, none = (Worst((), (), 1.0, growth, 80.0, 7) for growth in (1e-3, -1e-3))
-    holds = [Attacked.of(worst, 0.9, certified).holds for worst in (found, none) for certified in (True, False)]
+    growing, decaying = (Worst((), (), 1.0, growth, 80.0, 7) for growth in (1e-3, -1e-3))
+    holds = [Attacked.of(worst, 0.9, certified).holds for worst in (growing, decaying) for certified in (True, False)]
     assert holds == [False, True, True, True]
 
 
@@ -521,11 +521,11 @@ class OwnEngine(ExactEngine):
 def test_own_engines_judge_every_hand(delays):
     """A user's engine, built for each set of humans, gives the growth rates of the stacked exact engine."""
     scenario = load().replace(varying_delay=delays)
-    found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 3, MIXED, OwnEngine, 0.5), range(3))
-    np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
-    np.testing.assert_allclose(found.trace, found.exact, rtol=1e-5)
-    np.testing.assert_allclose(found.switching_mujoco, found.switching, rtol=1e-6)
-    assert not found.disagreements.any()
+    findings = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 3, MIXED, OwnEngine, 0.5), range(3))
+    np.testing.assert_allclose(findings.mujoco, findings.exact, rtol=1e-6)
+    np.testing.assert_allclose(findings.trace, findings.exact, rtol=1e-5)
+    np.testing.assert_allclose(findings.switching_mujoco, findings.switching, rtol=1e-6)
+    assert not findings.disagreements.any()
 
 
 def test_own_engines_refuse_latency():
@@ -547,13 +547,13 @@ def slow_loops(humans: int, seed: int, duration: float) -> Findings:
 
 
 def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
-    found = slow_loops(30, 3, 1.5)
-    assert not found.disagreements.any()
-    decided = found.trace_decides
+    findings = slow_loops(30, 3, 1.5)
+    assert not findings.disagreements.any()
+    decided = findings.trace_decides
     assert 0 < decided.sum() < decided.size
-    np.testing.assert_array_equal(found.trace[decided] > 0, found.exact[decided] > 0)
-    assert (np.abs(found.trace[decided] - found.exact[decided]) < found.trace_error[decided]).all()
-    assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # at least four time constants
+    np.testing.assert_array_equal(findings.trace[decided] > 0, findings.exact[decided] > 0)
+    assert (np.abs(findings.trace[decided] - findings.exact[decided]) < findings.trace_error[decided]).all()
+    assert (np.abs(findings.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # at least four time constants
 
 
 def test_traces_decide_only_what_eigenvalues_say():
@@ -565,9 +565,9 @@ def test_traces_decide_only_what_eigenvalues_say():
 
 def test_inaccurate_traces_are_no_disagreement():
     """A trace that grows while all maps decay is no disagreement if its error exceeds its rate."""
-    found = slow_loops(4, 0, 0.3)
+    findings = slow_loops(4, 0, 0.3)
     rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}
-    slow = replace(found, **rates, trace_error=np.full(4, 2.0))
+    slow = replace(findings, **rates, trace_error=np.full(4, 2.0))
     assert not slow.disagreements.any()
     question = slow_question(4, 0, 0.3)
     assert disagreement_words(question, slow) == "0"

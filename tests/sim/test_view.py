@@ -1,4 +1,4 @@
-"""Test the live loop of sim/view without a window; the tests supply the clock, the keys and the mouse.
+"""The live loop of sim/view works without a window; these tests supply the clock, the keys and the mouse.
 
 A frame is what the window shows at one time. Tolerances without a comment cover rounding, in pictures that of single
 precision.
@@ -254,12 +254,12 @@ def test_the_loop_runs_during_a_design(none):
     frame = running.frame(0.1)
     assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being prepared")
     later.work()
-    made = running.frame(0.2).prepared
-    assert (made.label, made.scenario.theta) == ("published", (1, 2))
+    designed = running.frame(0.2).prepared
+    assert (designed.label, designed.scenario.theta) == ("published", (1, 2))
     later.work()
     delayed = running.frame(0.3).prepared
     assert delayed.scenario.theta == (2, 3)
-    assert delayed.coupling is made.coupling  # a new delay keeps the coupling
+    assert delayed.coupling is designed.coupling  # a new delay keeps the coupling
 
 
 def test_a_push_is_felt_until_the_next(none):
@@ -370,8 +370,8 @@ def test_shapes_change_nothing_that_moves(name):
 def test_every_body_has_its_place():
     scene = build(SCENARIO.device, [Human((Link(0.3, 3, 200), Link(1, 2, 300))), SCENARIO.human[1]])
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
-    found = dict(zip(names, zip(_owners(scene), _places(scene), strict=True), strict=True))
-    assert found == {  # the device, and the place along its rail from the handle
+    places = dict(zip(names, zip(_owners(scene), _places(scene), strict=True), strict=True))
+    assert places == {  # the device, and the place along its rail from the handle
         "device_1/motor": (0, -1),
         "device_2/motor": (1, -1),
         "device_1/handle": (0, 0),
@@ -389,15 +389,15 @@ def test_a_person_s_body_stands_behind_both_arms():
 
 
 def test_the_overlay_says_growth_and_certificates(none, published):
-    said = dict(_overlay(session(none).frame(0.1), live=True))
-    assert said["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
-    assert said["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
-    assert said["any environment"] == "no certificate"
-    assert "0 overruns" in said["clock"]
-    said = dict(_overlay(session(published).frame(0.1), live=False))
-    assert said["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
-    assert said["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
-    assert said["time"] == "0.1 s"
+    overlay = dict(_overlay(session(none).frame(0.1), live=True))
+    assert overlay["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
+    assert overlay["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
+    assert overlay["any environment"] == "no certificate"
+    assert "0 overruns" in overlay["clock"]
+    overlay = dict(_overlay(session(published).frame(0.1), live=False))
+    assert overlay["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
+    assert overlay["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
+    assert overlay["time"] == "0.1 s"
     assert (GIVEN in dict(keys_help(True)).values(), GIVEN in dict(keys_help(False)).values()) == (True, False)
 
 
@@ -598,8 +598,8 @@ def test_arrows_show_what_devices_feel(none):
     """A device feels -f. The bar covers the range of -f since the last frame, so its centre is the range's middle."""
     scene, limit = none.simulation.scene, none.simulation.process.force_limit
     stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
-    told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
-    ways, bars = arrows(stage, replace(session(none).frame(0.0), **told))
+    forces = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
+    ways, bars = arrows(stage, replace(session(none).frame(0.0), **forces))
     forward = [way[0] for way in ways]  # in single precision; the last one is the push
     np.testing.assert_allclose(forward, [-1, 1, 1], rtol=0, atol=1e-6)
     for bar, handle, f, most in zip(bars, scene.handles, (2.0, -2.0), limit, strict=True):
@@ -640,16 +640,16 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as image:
         assert (image.size, image.n_frames, image.info["duration"]) == ((640, 640), 6, 100)
-    told = json.loads((tmp_path / "a.json").read_text())
-    assert [(e["event"], e["coupling"], e["theta"]) for e in told["events"]] == [
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert [(e["event"], e["coupling"], e["theta"]) for e in report["events"]] == [
         ("start", "none", [1, 2]),
         ("theta+1", "none", [2, 3]),
         ("published", "published", [2, 3]),
     ]
-    assert [round(e["exact_growth_rate_per_s"], 2) for e in told["events"]] == [1.48, 3.13, 0.69]
-    assert [round(e["t_s"], 2) for e in told["events"]] == [0, 0.2, 0.3]
-    assert told["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)
-    assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 6, "fps": 10}
+    assert [round(e["exact_growth_rate_per_s"], 2) for e in report["events"]] == [1.48, 3.13, 0.69]
+    assert [round(e["t_s"], 2) for e in report["events"]] == [0, 0.2, 0.3]
+    assert report["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)
+    assert report["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 6, "fps": 10}
     assert "NOT certified" in capsys.readouterr().out
 
 
@@ -678,8 +678,8 @@ def test_flat_pictures_show_the_force_that_is_felt(none):
 
     def first_device(f):
         both = np.array([f, 0.0])
-        told = {"mean": both, "low": both, "high": both, "history": np.tile(both, (400, 1)), "push": 0 * both}
-        picture = painter.picture(replace(frame, **told))
+        forces = {"mean": both, "low": both, "high": both, "history": np.tile(both, (400, 1)), "push": 0 * both}
+        picture = painter.picture(replace(frame, **forces))
         return np.nonzero((picture == (0, 115, 178)).all(axis=2))
 
     (rows, columns), (_, still) = first_device(6.0), first_device(0.0)
@@ -690,12 +690,12 @@ def test_flat_pictures_show_the_force_that_is_felt(none):
 
 
 def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
-    made, picture = [], _FlatPictures.picture
+    frames, picture = [], _FlatPictures.picture
 
     def interrupted(self, frame):
-        if len(made) == 4:
+        if len(frames) == 4:
             raise KeyboardInterrupt
-        made.append(frame)
+        frames.append(frame)
         return picture(self, frame)
 
     monkeypatch.setattr(_FlatPictures, "picture", interrupted)
@@ -724,10 +724,10 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
 
 def test_case_none_takes_a_coupling_later(tmp_path):
     """No coupling is designed for case none, so a coupling that is chosen later is designed for case I."""
-    where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
+    where, report = str(tmp_path / "a.gif"), tmp_path / "a.json"
     words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--fps", "5")
-    run(*words, "--video", where, "--json", str(told))
-    assert [e["coupling"] for e in json.loads(told.read_text())["events"]] == ["none", "designed"]
+    run(*words, "--video", where, "--json", str(report))
+    assert [e["coupling"] for e in json.loads(report.read_text())["events"]] == ["none", "designed"]
 
 
 # bad input
@@ -759,12 +759,12 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("words", "said"), BAD, ids=lambda part: " ".join(part) if isinstance(part, tuple) else "")
-def test_bad_input_is_named(words, said, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("words", "message"), BAD, ids=lambda part: " ".join(part) if isinstance(part, tuple) else "")
+def test_bad_input_is_named(words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
         command.main(list(words))
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -841,9 +841,9 @@ def test_the_window_shows_scene_and_devices(ball):
 
 def test_arrows_in_worlds_show_what_devices_feel(ball):
     running = LiveLoop(ball, Inline())
-    told = {"mean": np.array([1.0, -1.0]), "push": np.array([0.0, 2.0])}
+    forces = {"mean": np.array([1.0, -1.0]), "push": np.array([0.0, 2.0])}
     stage = stage_for(running)
-    ways, _ = arrows(stage, replace(running.frame(0.0), **told))
+    ways, _ = arrows(stage, replace(running.frame(0.0), **forces))
     along = [stage._along[i][0] for i in (0, 1, 1)]
     np.testing.assert_allclose([w @ a for w, a in zip(ways, along, strict=True)], [-1, 1, 1], rtol=0, atol=1e-6)
 

@@ -220,10 +220,10 @@ def test_a_run_sums_the_energy_given(tmp_path):
     loop = scenario(tmp_path, TRAY, more=UP, duration=0.5)
     trace = simulate(loop, certified(loop), engine="exact")
     world, dx = trace.meta["world"], np.diff(trace.x, axis=0)
-    given = np.cumsum((-trace.f[:-1] * dx - np.array(loop.delta) / T * dx**2).sum(axis=1)).max()
-    assert given > START_J
-    assert world["given_J"] == pytest.approx(given, abs=1e-12)
-    assert given <= START_J + world["released_J"]
+    most = np.cumsum((-trace.f[:-1] * dx - np.array(loop.delta) / T * dx**2).sum(axis=1)).max()
+    assert most > START_J
+    assert world["given_J"] == pytest.approx(most, abs=1e-12)
+    assert most <= START_J + world["released_J"]
 
 
 @pytest.mark.slow
@@ -472,10 +472,10 @@ def test_scenes_that_changed_void_their_linear_network(tmp_path, linear_tray, ch
     """
     before, design = linear_tray
     after = scenario(tmp_path, change)
-    said = Claim.of(assessed(after, "I", choose_given(design), energy_budget=START_J), design.certified_for)
-    assert not said.guaranteed
-    assert "near its initial pose only" in said.words
-    assert ("call linearise again" in said.words) == (change != TRAY)
+    claim = Claim.of(assessed(after, "I", choose_given(design), energy_budget=START_J), design.certified_for)
+    assert not claim.guaranteed
+    assert "near its initial pose only" in claim.words
+    assert ("call linearise again" in claim.words) == (change != TRAY)
     if change != TRAY:
         with pytest.raises(InputError, match="has changed since the scenario was loaded"):
             linearise(before)
@@ -501,9 +501,9 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     where = "The coupling is certified for the linear network of scene.xml near its initial pose only."
     store(linear.loop("I"), design, tmp_path / "design.json")
     for coupling in (design, tmp_path / "design.json"):
-        said = simulate(loop.replace(duration=0.05), coupling).meta["guarantee"]
-        assert said.startswith("No guarantee: the coupling is not certified for every environment: needs ")
-        assert said.endswith(where)
+        claim = simulate(loop.replace(duration=0.05), coupling).meta["guarantee"]
+        assert claim.startswith("No guarantee: the coupling is not certified for every environment: needs ")
+        assert claim.endswith(where)
     monkeypatch.setattr("haptic_loop.cli.world.least_at_port", lambda *given: {})
     words = ("--scenario", str(tmp_path / "loop.toml"), "--coupling", str(tmp_path / "design.json"))
     _, shown = command(capsys, "audit", *words, "--out", str(tmp_path / "out"))

@@ -1,4 +1,4 @@
-"""Test the map over gains K and B: its ratios equal closed forms and single couplings, its verdicts single loops.
+"""Ratios of maps over gains K and B equal closed forms and single couplings; their verdicts equal single loops.
 
 Tolerances without a comment cover rounding. Eigenvalues round by up to 1e-7 1/s, after division by T.
 """
@@ -195,9 +195,9 @@ def test_suprema_equal_those_of_a_dense_sweep():
     dense = peaks(np.broadcast_to(np.linspace(0, np.pi, 400_001), (3, 400_001))).max(axis=1)
     # every point occurs twice, as in a grid around a pair of poles
     common, own = np.linspace(0, np.pi, 60), np.broadcast_to(np.linspace(0, np.pi, 60), (3, 60))
-    found = suprema(peaks, common, own)
+    refined = suprema(peaks, common, own)
     # Points are 8e-6 rad apart and second derivatives at most 800 per rad^2: maxima exceed the points by under 1e-8.
-    np.testing.assert_allclose(found, dense, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(refined, dense, rtol=0, atol=2e-8)
     assert suprema(lambda w: np.where(w > 3, np.nan, w), common, own).tolist() == [np.inf] * 3
 
 
@@ -272,8 +272,8 @@ def test_marks_take_the_worst_contact_state():
     states = [exact_loops(variants(sweep.devices, some), state.F(coupling)) for state in loop.frozen()]
     growth = [dominant_mode(state).growth for state in states]
     assert (growth[0] < growth[1] - 1).any()
-    found = zwidth_map._growth(sweep, crowd, 1500.0, 0.4)
-    np.testing.assert_allclose(found, np.maximum(*growth), rtol=0, atol=1e-7)
+    worst = zwidth_map._growth(sweep, crowd, 1500.0, 0.4)
+    np.testing.assert_allclose(worst, np.maximum(*growth), rtol=0, atol=1e-7)
 
 
 def test_random_hands_meet_the_latest_forces():
@@ -304,12 +304,12 @@ def test_sustained_oscillations_are_told_from_decays():
         (wave(1e-2, -2.0, 7) + wave(2e-5, 0.3, 80), True),  # a slow decay does not hide a fast growth
         (wave(1e-3, 50.0, 80), True),  # far beyond 1 km
     ]
-    found = oscillation(np.concatenate([x for x, _ in cases], axis=2), T, 1e-5)
-    assert found.sustained.tolist() == [verdict for _, verdict in cases]
+    judged = oscillation(np.concatenate([x for x, _ in cases], axis=2), T, 1e-5)
+    assert judged.sustained.tolist() == [verdict for _, verdict in cases]
     # An octave's amplitude is that of the sinusoid in it; the relative error was 1e-7 in the middle of an octave.
-    assert found.amplitude[0] == pytest.approx(1e-4, rel=0.02)
-    assert found.frequency_hz[0] == pytest.approx(40, abs=1)  # the spectrum's lines are 1.3 Hz apart
-    assert np.isinf(found.amplitude[-1])
+    assert judged.amplitude[0] == pytest.approx(1e-4, rel=0.02)
+    assert judged.frequency_hz[0] == pytest.approx(40, abs=1)  # the spectrum's lines are 1.3 Hz apart
+    assert np.isinf(judged.amplitude[-1])
     assert slowest_seen(4.0) == 4.0
 
 
@@ -322,9 +322,9 @@ def test_a_slow_swing_that_decays_is_no_oscillation():
     for hz in (0.6, 1.0, 1.12, 1.2):
         slow = 4e-3 * np.exp(-0.45 * t) * np.cos(2 * np.pi * hz * t + phases)
         assert not oscillation(slow, T, 1e-5).sustained.any()
-        found = oscillation(slow + 2e-5 * np.sin(2 * np.pi * 6 * t), T, 1e-5)
-        assert found.sustained.all()
-        assert found.amplitude == pytest.approx(2e-5, rel=0.2)  # 6 Hz is near an octave's edge: the error was 1 %
+        judged = oscillation(slow + 2e-5 * np.sin(2 * np.pi * 6 * t), T, 1e-5)
+        assert judged.sustained.all()
+        assert judged.amplitude == pytest.approx(2e-5, rel=0.2)  # 6 Hz is near an octave's edge: the error was 1 %
 
 
 def walled(count):
@@ -344,8 +344,8 @@ def test_batched_processes_equal_single_ones(walls):
         (stack,) = rigid(1).force_maps(np.array([500.0, 900.0]), np.array([0.2, 1.0]))
         processes = [Process(Law(stack[i]), limit, step) for i in range(2)]
     x = rng.normal(scale=1e-3, size=(20, 2))
-    made = processes[0].law.together([process.law for process in processes])
-    together = StepBuffer(processes[0], 20, 2, 0, len(processes), made)
+    law = processes[0].law.together([process.law for process in processes])
+    together = StepBuffer(processes[0], 20, 2, 0, len(processes), law)
     alone = [StepBuffer(process, 20, 2) for process in processes]
     for k in range(20):
         together.s[k, 0] = x[k]
@@ -413,10 +413,10 @@ def points(sweep, K, B, **changes):
 
 
 def test_the_linear_points_agree_with_the_eigenvalues():
-    found = points(rigid(1), [400.0, 2500.0], [0.0, 1.0])
-    assert found.verdicts[0] == "rests"
-    assert found.verdicts[2:] == ["oscillates", "oscillates"]
-    assert not found.differ.any()
+    corners = points(rigid(1), [400.0, 2500.0], [0.0, 1.0])
+    assert corners.verdicts[0] == "rests"
+    assert corners.verdicts[2:] == ["oscillates", "oscillates"]
+    assert not corners.differ.any()
 
 
 def with_devices(sweep, **changes):
@@ -524,10 +524,10 @@ def test_a_failing_mark_or_cell_is_reported():
 
     assert report(-1.0, good).holds
     assert not report(-1.0, good, bad).holds
-    told = report(1e-3, good)
-    assert not told.holds
-    assert [(r.certified_cells, r.contradicted_cells) for r in told.ratios.values()] == [(3, 1)] * 2
-    assert told.population.stable_cells == 3
+    failed = report(1e-3, good)
+    assert not failed.holds
+    assert [(r.certified_cells, r.contradicted_cells) for r in failed.ratios.values()] == [(3, 1)] * 2
+    assert failed.population.stable_cells == 3
     moving = Points(np.array([0]), np.array([True]), *np.array([[1e-3], [40.0], [-1.0]]))
     assert not report(-1.0, good, points=moving).holds
     assert report(-1.0, good, points=moving, sweep=with_devices(sweep, friction=0.2)).holds
