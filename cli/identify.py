@@ -40,7 +40,7 @@ from haptic_loop.hw.identify import (
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import Session, session_for
+from haptic_loop.hw.session import STRONGEST, Session, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome
 from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
 from haptic_loop.models.device import Device, RigidDevice
@@ -177,7 +177,9 @@ def _sitting(
     r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise: the options are figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] stops a device that is lighter than declared
-    session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
+    axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
+    vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
+    session = session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
     def played(link: int) -> Excitation:

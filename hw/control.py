@@ -258,6 +258,7 @@ class TraceRow(NamedTuple):
     state: State | None
     arming: int = 0  # number of the arming in the session
     test: tuple[float, ...] | None = None  # (m,) [N] force of the encoder test, which the gain does not scale
+    limited: bool = False  # whether an energy account made the force smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,12 +362,13 @@ class Drive:
             if closing and self._last_test and self.gain == 0:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain == 0 and test is None
+        limited = self._counters.limited
         shaped = self.limits.shape(wanted, self.force, self.gain, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
         if budget := self._arming.budget:
-            limited = budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
-            if limited != steps:
-                force, steps = self.units.forces(limited), limited
+            allowed = budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
+            if allowed != steps:
+                force, steps = self.units.forces(allowed), allowed
                 self._counters.limited += 1
         if self.world:
             force, steps = self._through_shell(self.world, force, steps, x, state, ticks, test)
@@ -375,7 +377,8 @@ class Drive:
         self._counters.slowed += shaped.slowed
         if self._commands:
             self._commands.tell(state.tick, steps)
-        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test))
+        limits = self._counters.limited > limited
+        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test, limits))
         return steps
 
     def _through_shell(
@@ -401,6 +404,7 @@ class Drive:
             if pushes:
                 allowed = tested
                 sent = tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
+        self._counters.limited += allowed != steps
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
     def _check_motion(self, positions: Sequence[tuple[float, ...]], seconds: float) -> None:

@@ -428,8 +428,8 @@ class EncoderTest:
             faint = f"{at} moves axis {axis} by {1e3 * expected:.2g} mm, less than 2 counts of {1e3 * count:.3g} mm"
             return f"{faint}: its encoder is not tested. Raise --force-cap"
         if self._unknown_hands and self._swings:
-            free = f"axis {axis} did not move as a free handle does at the end of the session"
-            return f"{free}: a hand held it, or its motor or encoder is wrong"
+            free = f"axis {axis} did not move as a free handle at the end: let go of all handles before a session ends"
+            return f"{free}. If nobody held it, motor or encoder is wrong"
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._answer.span[self._axis]) > self._still[self._axis]:

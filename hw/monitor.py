@@ -246,7 +246,7 @@ class Counters:
     host_errors: int = 0  # frames of the device that could not be read
     clipped: int = 0  # ticks with a force at its cap, by the limiter or by clipping
     slowed: int = 0  # ticks with a force at the slew rate limit
-    limited: int = 0  # ticks in which the energy budget made forces smaller
+    limited: int = 0  # ticks in which the energy budget or a world's shell made forces smaller
     unlike: int = 0  # ticks at which the device applied a force that the host did not send
 
 

@@ -33,13 +33,14 @@ _ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers with one e
 
 
 class Recorder:
-    """Collect the rows of a trace as bytes: 32 m + 29 bytes per tick for m channels."""
+    """Collect the rows of a trace as bytes: 32 m + 30 bytes per tick for m channels."""
 
     def __init__(self, channels: int) -> None:
         m = self.channels = channels
         floats = [("x", "<f8", m), ("asked", "<f8", m), ("test", "<f8", m), ("gain", "<f8")]
-        fields = [("sent", "<i4", m), ("applied", "<i4", m), *((name, "<i4") for name in _ONCE), ("received", "?")]
-        self._row, self._form = np.dtype([*floats, *fields]), Struct(f"<{3 * m + 1}d{2 * m + len(_ONCE)}i?")
+        integers = [("sent", "<i4", m), ("applied", "<i4", m), *((name, "<i4") for name in _ONCE)]
+        self._row = np.dtype([*floats, *integers, ("received", "?"), ("limited", "?")])
+        self._form = Struct(f"<{3 * m + 1}d{2 * m + len(_ONCE)}i??")
         self._rows, self._zero = bytearray(), (0,) * m
 
     def __call__(self, row: TraceRow) -> None:
@@ -49,14 +50,14 @@ class Recorder:
             sent, applied, told = zero, zero, (0, NO_MARGIN, 0)
         else:
             sent, applied, told = row.sent, state.applied, (state.echo, state.margin_us, state.status)
-        once = row.tick, row.arming, *told, state is not None
+        once = row.tick, row.arming, *told, state is not None, row.limited
         self._rows += self._form.pack(*row.x, *row.asked, *(row.test or zero), row.gain, *sent, *applied, *once)
 
     def __len__(self) -> int:
         return len(self._rows) // self._form.size
 
     def link(self) -> dict[str, NDArray[Any]]:
-        """Return arrays by the names of _LINK, with `x` (N, m) [m], `applied` (N, m) [steps] and `echo` as well."""
+        """Return arrays by the names of _LINK, and `x` (N, m) [m], `applied` (N, m) [steps], `echo` and `limited`."""
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 

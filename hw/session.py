@@ -28,7 +28,7 @@ _ARMING_US = 600_000  # time per axis in which the device must arm and its encod
 _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimited during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
-_STRONGEST = 12.0  # [N] largest force at the hand, whatever a scenario allows
+STRONGEST = 12.0  # [N] largest force at the hand, whatever a scenario allows
 
 
 Said = tuple[wire.Force | wire.Stop, ...]  # messages to the device
@@ -140,6 +140,7 @@ class Session:
             self.drive = Drive(arming, *told, self._expected, self._noise.still)
             if self.drive.world:
                 self.worlds.append(self.drive.world)
+            self._after = Stage.FINISHED
             self._enter(Stage.ARMING, "requested")
         return ()
 
@@ -305,9 +306,9 @@ class Session:
         if first and any(self.drive.reference or ()):
             places = ", ".join(f"{1e3 * x:+.4g}" for x in self.units.positions(self.drive.reference or ()))
             self._log(f"positions count from where the handles are: {places} mm")
-        if self.stage != Stage.DISARMING and (late := self.link.too_late()):
+        if self._after == Stage.FINISHED and (late := self.link.too_late()):
             self._soften(late)
-        if self.stage != Stage.DISARMING and (dead := self.drive.encoders.dead):
+        if self._after == Stage.FINISHED and (dead := self.drive.encoders.dead):
             self._ramp_out(Stage.STOPPED, dead)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
@@ -341,10 +342,11 @@ class Session:
     # Ramps and the end
 
     def _soften(self, late: str) -> None:
-        """Ramp out, and continue with the next coupling if there is one."""
+        """Ramp out, and continue with the next coupling if there is one and the session is not about to end."""
         assert self.program is not None
-        softer = self.programs.index(self.program) + 1 < len(self.programs)
-        self._ramp_out(None if softer else Stage.STOPPED, late + ("" if softer else ", and nothing softer is left"))
+        ending, softer = self.stage == Stage.DISARMING, self.programs.index(self.program) + 1 < len(self.programs)
+        left = "" if ending or softer else ", and nothing softer is left"
+        self._ramp_out(None if softer and not ending else Stage.STOPPED, late + left)
 
     def _ramp_out(self, after: Stage | None, cause: str) -> None:
         self._after = after
@@ -406,8 +408,10 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
     return scenario.replace(device=tuple(devices)) if devices != [*scenario.device] else scenario
 
 
-def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """Return a session whose forces at the hand are at most `cap` [N].
+def session_for(scenario: Scenario, settings: LinkSettings, cap: float = STRONGEST, **more: Any) -> Session:
+    """Return a session in which no device's force at the hand exceeds `cap` [N].
+
+    Where the axes of a device are limited one by one, each of its n axes gets `cap` / sqrt(n).
 
     Raises:
         InputError: A limit or T is impossible, or a rotary scenario has no radius.
@@ -418,7 +422,11 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
     limits, balls = scenario.limiter_limits
     r, vectors = scenario.lever, tuple((ball.start, ball.stop) for ball in balls)
     scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": SafetyLimits.speed / r, "lever": r} | more
-    caps = tuple(min(cap * r, limit) for limit in limits)
+    counts = [len(device.free) for device in scenario.device]
+    axes = np.repeat(counts, counts)  # (m,) axes of the channel's device that are limited one by one
+    for first, end in vectors:
+        axes[first:end] = 1
+    caps = tuple(min(cap * r / n**0.5, limit) for n, limit in zip(axes.tolist(), limits, strict=True))
     try:
         safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
         return Session(scenario, safety, settings)

@@ -216,11 +216,13 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
     if 2 * session.counters.slowed > ticks > 0:
         return f"{100 * session.counters.slowed / ticks:.0f} % of the forces were cut by the slew rate"
     second = min(ticks, round(1 / session.scenario.T))
-    capped = session.limits.capped(link["gain"][:, None] * link["asked"], _AT_CAP)
-    cut = np.convolve(capped.any(axis=1), np.ones(second) / second, "valid").max() if ticks else 0.0
-    if cut > 0.5:
-        advice = "raise --force-cap, request smaller forces, or look for a reversed sign"
-        return f"{100 * cut:.0f} % of the forces were cut in a second: {advice}"
+    capped = session.limits.capped(link["gain"][:, None] * link["asked"], _AT_CAP).any(axis=1)
+    request = "raise --force-cap, request smaller forces, or look for a reversed sign"
+    energy = "the energy account allowed no more. Raise --energy-budget, or look for a part that gives energy"
+    for cut, advice in ((capped, request), (link["limited"], energy)):
+        share = np.convolve(cut, np.ones(second) / second, "valid").max() if ticks else 0.0
+        if share > 0.5:
+            return f"{100 * share:.0f} % of the forces were cut in a second: {advice}"
     for i, growth in enumerate(growths, start=1):
         if growth.trend == "grows":
             return f"an oscillation grew in arming {i}"

@@ -331,6 +331,24 @@ def test_undetectable_hands_add_no_damping(odd):
         settled([sitting(odd, "ideal")])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", ["12.0", "[12.0, 12.0, 12.0]"])
+def test_all_axes_of_a_device_are_identified(tmp_path, limit):
+    """The excitation moves three axes at once, and no cap cuts it, whether vectors or single axes are limited."""
+    (tmp_path / "one.toml").write_text(f"""name = "one"
+T = 1e-3
+theta = [1]
+device = [{{ kind = "rigid", mass = 0.25, damping = 1.37, axes = 3, force_limit = {limit} }}]
+[environment]
+contacts = ["left"]
+springs = [{{ between = ["left", "ground"], stiffness = 300.0, damping = 1.0 }}]
+""")
+    options = f"--rehearse --scenario {tmp_path / 'one.toml'} --measure 60 --seconds 0.5 --travel 8 --sittings 1"
+    identify_command([*options.split(), "--out", str(tmp_path)])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [axis["friction"]["mass"] for axis in report["axes"]] == pytest.approx([0.25] * 3, rel=1e-3)
+
+
 @pytest.mark.validate
 def test_damping_in_one_sitting_needs_a_third(tmp_path, monkeypatch):
     """In the first sitting a dashpot of 0.3 N s/m is at the handles. Two sittings disagree, two of three agree."""

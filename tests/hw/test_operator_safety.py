@@ -184,15 +184,19 @@ def rehearsal_until_finished(scenario, rungs):
     return session
 
 
-def test_a_second_of_clipped_forces_counts(scenario, rungs):
-    """A session has not finished if more than half of the 833 ticks of any second were clipped, however long it was."""
+@pytest.mark.parametrize(("by_cap", "advice"), [(True, "raise --force-cap"), (False, "Raise --energy-budget")])
+def test_a_second_of_cut_forces_counts(scenario, rungs, by_cap, advice):
+    """A session has not finished if cap or energy account cut over half of the 833 ticks of any second."""
     session = rehearsal_until_finished(scenario, rungs)
     for cut, stage in ((400, "finished"), (450, "stopped")):
         recorder, state = Recorder(2), session.link.last
         for k in range(4000):
-            asked = (12.0, 0.0) if 2000 <= k < 2000 + cut else (0.1, 0.0)
-            recorder(TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state))
+            within = 2000 <= k < 2000 + cut
+            asked = (12.0, 0.0) if within and by_cap else (0.1, 0.0)
+            row = TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state, limited=within and not by_cap)
+            recorder(row)
         assert outcome("I", session, recorder, 0).session.stage == stage
+    assert advice in session.cause
 
 
 @pytest.mark.parametrize(

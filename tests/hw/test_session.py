@@ -25,12 +25,12 @@ from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
 from haptic_loop.hw.recording import Recorder, _recipes_of, load, replay
 from haptic_loop.hw.rehearsal import Rehearsal, rehearse
-from haptic_loop.hw.session import Session
+from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import outcome, save
 from haptic_loop.models.hold import hold
 from haptic_loop.models.scene import plant
 from haptic_loop.sim.run import assemble, outside_forces, run
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, parse
 from haptic_loop.sim.scenario import load as load_scenario
 from tests.checks.faults import (
     CASES,
@@ -146,6 +146,28 @@ def test_repeating_devices_count_as_lost(harmless):
         assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
 
     in_fork(repeat)
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("down:jitter=0.0007", "answers were late"),
+        pytest.param("down:drop=0.35", "had no answer in time", marks=pytest.mark.slow),
+    ],
+)
+def test_links_that_fail_in_the_last_test_stop_sessions(harmless, fault, cause):
+    def fail():
+        session = harmless.session
+        strike(harmless, f"{fault}@0.75")
+        session.stop("asked to", session.now)
+        harmless.run_until_armed(0.74)
+        assert (session.stage, session.gain) == (Stage.DISARMING, 0.0)
+        harmless.run_until_armed(2.0)
+        return session.stage, session.cause, harmless.zero_after(1.0)
+
+    stage, words, zero = in_fork(fail)
+    assert (stage, zero) == (Stage.STOPPED, 0.0)
+    assert cause in words
 
 
 @pytest.mark.parametrize(
@@ -271,6 +293,42 @@ def test_sessions_equal_a_simulation_that_rounds(scenario, rungs):
     # another order of the sums could round a force the other way; in this run it never does
     np.testing.assert_array_equal(applied, link["applied"][first:])
     np.testing.assert_allclose(np.array(counts) * 1e-6, link["x"][first:], rtol=0, atol=1e-15)
+
+
+# caps
+
+
+@pytest.mark.parametrize(
+    ("device", "caps"),
+    [
+        ("axes = 3", [1.3] * 3),  # The length of the vector is limited.
+        ("axes = 3, force_limit = [12.0, 12.0, 12.0]", [1.3 / 3**0.5] * 3),
+        ("axes = 3, force_limit = [12.0, 12.0, 0.5]", [1.3 / 3**0.5] * 2 + [0.5]),
+        ('axes = 3, clamped = ["z"], force_limit = [12.0, 12.0, 12.0]', [1.3 / 2**0.5] * 2),
+        ('axes = 3, clamped = ["x", "z"], force_limit = [12.0, 12.0, 12.0]', [1.3]),
+    ],
+)
+@pytest.mark.parametrize("wall", [False, True])
+def test_no_force_vector_exceeds_the_cap(device, caps, wall):
+    parts = 'walls = [{ between = ["left", "ground"], normal = [0, 1, 0], gap = 0.01, stiffness = 500.0 }]' * wall
+    scenario = parse(f"""
+name = "box"
+T = 1e-3
+theta = [1, 1]
+device = [{{ kind = "rigid", {device} }}, {{ kind = "rigid", axes = 3 }}]
+[environment]
+contacts = ["left", "right"]
+springs = [{{ between = ["left", "right"], stiffness = 800.0, damping = 1.0 }}]
+{parts}
+""")
+    limits = session_for(scenario, FAST, 1.3).limits
+    box = [1.3 / 3**0.5] * 3
+    left, right = (box if "force_limit" not in device else caps, box) if wall else (caps, [1.3] * 3)
+    assert limits.cap == pytest.approx([*left, *right])
+    asked = np.full(scenario.channels, 50.0)
+    force = np.array(limits.shape(asked, limits.cap, 1.0, scenario.T).force)
+    for own in (force[:-3], force[-3:]):
+        assert np.linalg.norm(own) <= 1.3 * (1 + 1e-12)
 
 
 # delays in the design
@@ -501,6 +559,19 @@ def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tm
     assert part.ticks == len(recorder)
     assert "0.05 J" in part.guarantee
     assert part.reserved_J <= part.energy_J
+
+
+def test_sessions_with_forces_cut_by_the_budget_stop(scenario, rungs, monkeypatch):
+    """The budget limits most forces of an active controller, and the record has every tick in which it does."""
+    monkeypatch.setattr("haptic_loop.hw.control.host_controller", lambda scenario, *given: _Thief(scenario.T))
+    recorder, stop = Recorder(2), (0.8, lambda session, now: session.stop("asked to", now))
+    settings = LinkSettings(measure=100, energy_budget=(0.01, np.inf))
+    run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings, actions=[stop])
+    assert run.run_to_the_end(3.0).stage == Stage.FINISHED
+    report = outcome("I", run.session, recorder, 0)
+    assert recorder.link()["limited"].sum() == report.energy_budget[0].limited_ticks > 200
+    assert report.session.stage == "stopped"
+    assert "Raise --energy-budget" in report.session.cause
 
 
 @pytest.mark.slow

@@ -117,6 +117,7 @@ def test_rehearsals_hold_back_an_active_scene(tmp_path, capsys, budget):
     )
     _, report, shown = session(tmp_path, capsys, *words)
     (world,) = report["world"]
+    assert report["link"]["counters"]["limited"] >= world["ticks_acted"]
     assert report["scene"]["active"] == ["actuator 0"]
     assert "active parts: actuator 0" in shown
     trace, link = read(tmp_path / "out" / "trace.npz")
