@@ -23,14 +23,14 @@ def driven(
     process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
     """Close the loop from plant states `start`, (2n, nsim). With `last`, store only blocks of the last `last` ticks."""
-    kept = []
+    blocks = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
         if last is None or first + count > ticks - last:
-            kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
+            blocks.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
 
     run_blocks(process, engine, outside, ticks, start, look, 1000)
-    return Driven(*(np.concatenate(rows) for rows in zip(*kept, strict=True)))
+    return Driven(*(np.concatenate(rows) for rows in zip(*blocks, strict=True)))
 
 
 def tick_by_tick(engine):

@@ -47,14 +47,14 @@ def load() -> None:
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
-    """Cache slow results that many tests and processes need. Only the names in the listed modules are replaced."""
+    """Cache slow results for all tests and processes. Only the listed modules get the functions with a cache."""
     import haptic_loop.cli.check
     import haptic_loop.cli.design
     from haptic_loop.design import api, assessment, bound, designs
     from haptic_loop.hw import control
     from haptic_loop.sim import couplings
 
-    for made, modules in (
+    for function, modules in (
         (designs.design_by_kind, (haptic_loop.cli.design, api, couplings)),
         (bound.bound, (bound,)),
         (assessment.required_damping, (assessment, control)),
@@ -65,7 +65,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (api.instead, (api,)),
     ):
         for module in modules:
-            patch(module, made.__name__, _remembering(folder, made))
+            patch(module, function.__name__, _cached(folder, function))
 
 
 def draw_once(folder: Path) -> None:
@@ -87,37 +87,37 @@ def draw_once(folder: Path) -> None:
     plots.save = drawn
 
 
-def _remembering(folder: Path, make):
+def _cached(folder: Path, make):
     """Return `make` with a cache of its results in the folder."""
     from haptic_loop.design import budgets
     from haptic_loop.design.coupling_file import digest
 
     @functools.wraps(make)
-    def remembered(loop, *asked, **options):
+    def cached(loop, *arguments, **options):
         try:
-            loop_and_asked = digest(loop), make.__name__, budgets.GROWTH, _asked(make, loop, *asked, **options)
+            key = digest(loop), make.__name__, budgets.GROWTH, _arguments(make, loop, *arguments, **options)
         except TypeError:  # Objects that a test defines have no digest.
-            return make(loop, *asked, **options)
-        file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
+            return make(loop, *arguments, **options)
+        file = folder / hashlib.sha256(repr(key).encode()).hexdigest()
         with file.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # Other processes wait for the result.
             if not file.exists():
-                made = make(loop, *asked, **options)
+                result = make(loop, *arguments, **options)
                 part = file.with_suffix(".part")
-                part.write_bytes(pickle.dumps(made))
+                part.write_bytes(pickle.dumps(result))
                 part.rename(file)
         return pickle.loads(file.read_bytes())
 
-    return remembered
+    return cached
 
 
-def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
+def _arguments(make, loop, *arguments, **options) -> list[tuple[str, str]]:
     """Return (name, text) of each argument but loop and functions; equal calls give equal texts."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT
 
-    call = inspect.signature(make).bind(loop, *asked, **options)
+    call = inspect.signature(make).bind(loop, *arguments, **options)
     call.apply_defaults()
     words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
     if any(isinstance(x, Condition) and not type(x).__module__.startswith("haptic_loop.") for x in words.values()):
@@ -127,10 +127,10 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
             raise TypeError("a design that a user defines")
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
-    return sorted((name, _word(x)) for name, x in words.items())
+    return sorted((name, _text(x)) for name, x in words.items())
 
 
-def _word(x: Any) -> str:
+def _text(x: Any) -> str:
     """Return equal texts for equal arguments. Raises TypeError for an object without a value."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.coupling_file import digest
@@ -138,9 +138,9 @@ def _word(x: Any) -> str:
     if hasattr(x, "form"):
         return digest(x.form())
     if isinstance(x, Condition):
-        return f"{type(x).__qualname__}({sorted((name, _word(part)) for name, part in vars(x).items())})"
+        return f"{type(x).__qualname__}({sorted((name, _text(part)) for name, part in vars(x).items())})"
     if " at 0x" in repr(x):
-        raise TypeError(f"{type(x).__name__} has no word")
+        raise TypeError(f"{type(x).__name__} has no value")
     return repr(x)
 
 
@@ -159,16 +159,16 @@ def run(command: str | list[str], folder: Path, **environment: str) -> subproces
     words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
     with tempfile.TemporaryDirectory() as place:
         files = [Path(place, name) for name in ("out", "err")]
-        code = _asked_for(words[1:], folder, files, {"COLUMNS": "100"} | environment)
+        code = _request_fork(words[1:], folder, files, {"COLUMNS": "100"} | environment)
         return subprocess.CompletedProcess(words, code, *(file.read_text(encoding="utf-8") for file in files))
 
 
 def begin(module: str, *options: str, out: Path, err: Path) -> int:
     """Begin `python -m MODULE ...` in a new session, with its output in `out` and `err`; return the process id."""
-    return _asked_for(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
+    return _request_fork(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
 
 
-def _asked_for(words: list[str], folder: Path, files: list[Path], environment: dict[str, str], beside=False) -> int:
+def _request_fork(words: list[str], folder: Path, files: list[Path], environment: dict[str, str], beside=False) -> int:
     """Return the exit code of the command or, with `beside`, the process id of a command that runs on."""
     request = {"words": words, "folder": str(folder), "files": [str(file) for file in files]}
     request |= {"environment": environment, "beside": beside}

@@ -70,9 +70,9 @@ class RealTimeEmulator:
     def now(self) -> float:
         return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
-    def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
+    def run(self, seconds: float, must_stop: Callable[[], bool]) -> None:
         due, unplugged_at = self._period, None
-        while not asked_to_stop() and self.now() < 1e6 * seconds:
+        while not must_stop() and self.now() < 1e6 * seconds:
             self._wait(due)
             now = self.now()
             if now < due:
@@ -131,9 +131,9 @@ class EmulatorProcess:
 
     def __init__(self, *options: str) -> None:
         self._folder = tempfile.TemporaryDirectory()
-        self._said = Path(self._folder.name, "err")
+        self._errors = Path(self._folder.name, "err")
         path = Path(self._folder.name, "out")
-        self._number = begin("tests.pseudo_terminal", *options, out=path, err=self._said)
+        self._number = begin("tests.pseudo_terminal", *options, out=path, err=self._errors)
         assert _within(_PATIENCE, lambda: path.exists() and path.read_text().endswith("\n")), "no emulator started"
         self.path = path.read_text().strip()
 
@@ -141,14 +141,14 @@ class EmulatorProcess:
         """Return the final report on the device; end the process if it still runs after `patience` [s]."""
 
         def ended() -> bool:
-            return self._said.read_text().endswith("}\n")
+            return self._errors.read_text().endswith("}\n")
 
         if not _within(patience, ended):
             os.kill(self._number, signal.SIGTERM)
-            assert _within(_PATIENCE, ended), self._said.read_text()
-        said = json.loads(self._said.read_text().splitlines()[-1])
+            assert _within(_PATIENCE, ended), self._errors.read_text()
+        report = json.loads(self._errors.read_text().splitlines()[-1])
         self._folder.cleanup()
-        return said
+        return report
 
 
 def _within(seconds: float, true: Callable[[], bool]) -> bool:
@@ -179,16 +179,16 @@ def main() -> None:
     parser.add_argument("--nobody", action="store_true")
     args = parser.parse_args()
     scenario, faults = load(args.scenario), tuple(FaultInjection.parse(text) for text in args.fault)
-    emulator, terminal, stops = Emulator(nobody(scenario) if args.nobody else scenario, faults), Terminal(), []
+    emulator, terminal, signals = Emulator(nobody(scenario) if args.nobody else scenario, faults), Terminal(), []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, frame: stops.append(received))
+        signal.signal(number, lambda received, frame: signals.append(received))
     print(terminal.path, flush=True)
     up, down = (Line(direction, faults, 0) for direction in ("up", "down"))
     running = RealTimeEmulator(emulator, terminal, up, down, scenario.T, args.pace)
     gc.collect()
     gc.freeze()
     gc.disable()
-    running.run(args.duration, lambda: bool(stops) or args.parent not in (0, os.getppid()))
+    running.run(args.duration, lambda: bool(signals) or args.parent not in (0, os.getppid()))
     print(json.dumps({"phase": emulator.device.phase.name.lower()}), file=sys.stderr)
 
 

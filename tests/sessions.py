@@ -19,13 +19,13 @@ def session_with(scenario, settings=FAST):
     return Session(scenario, SafetyLimits(tuple(d.force_limit for d in scenario.device)), settings)
 
 
-def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **options):
+def rehearsal_of(scenario, couplings, *faults, recorder=None, settings=FAST, **options):
     """Return a rehearsal with the certified couplings `rungs`, and faults written as for --fault."""
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_with(scenario, settings)
     if recorder is not None:
         session.record = recorder
-    return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
+    return Rehearsal(session, Emulator(scenario, faults), lambda ages: couplings, faults, **options)
 
 
 def strike(rehearsal, *faults, board=0):
@@ -71,10 +71,10 @@ class MovesAxes:
         self.axes, self._emulator, self._mm, self._plan, self._requests = [], emulator, mm, [], set()
 
     def __call__(self, session):
-        asked = re.search(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
-        if asked and session.request not in self._requests:
+        request = re.search(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
+        if request and session.request not in self._requests:
             self._requests.add(session.request)
-            self.axes.append(int(asked[1]))
+            self.axes.append(int(request[1]))
             again = session.request.startswith("axis")  # The request begins with the wrong motion.
             moves = [(0.0, -self._mm), (0.8, self._mm)] if again else [(0.0, self._mm)]
             self._plan += [(session.now + 1e6 * after, mm) for after, mm in moves]

@@ -21,15 +21,17 @@ def changed() -> list[str]:
 def tests_of(paths: list[str]) -> list[str]:
     """Return the test files and folders for these paths, in the order of the module docstring."""
     tests = [path for path in paths if path.startswith("tests/") and "/test_" in path and Path(path).exists()]
-    found = [path for path in tests if "benchmarks" not in path] + ["tests/project/test_layers.py"]
+    first = [path for path in tests if "benchmarks" not in path] + ["tests/project/test_layers.py"]
     mirrors = [_mirror(path) for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES]
-    return list(dict.fromkeys(found + [test for mirror in sorted(mirrors, key=len) for test in sorted(mirror)]))
+    return list(dict.fromkeys(first + [test for mirror in sorted(mirrors, key=len) for test in sorted(mirror)]))
 
 
 def sources_of(paths: list[str]) -> list[str]:
     """Return the arguments of pyright, at least one file; without a file it would check everything."""
-    found = [path for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES and Path(path).exists()]
-    return found or ["cli/__init__.py"]
+    sources = [
+        path for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES and Path(path).exists()
+    ]
+    return sources or ["cli/__init__.py"]
 
 
 def _mirror(path: str) -> set[str]:
@@ -41,8 +43,8 @@ def _mirror(path: str) -> set[str]:
     imported = re.compile(
         rf"^from {place}(\.{stem} import| import .*\b{stem}\b)|^import {place}\.{stem}\b", re.MULTILINE
     )
-    found = [] if own else [one for one in tests if imported.search(one.read_text())]
-    own = own or {str(one) for one in found if one.parent.name == package} or set(map(str, found))
+    importers = [] if own else [one for one in tests if imported.search(one.read_text())]
+    own = own or {str(one) for one in importers if one.parent.name == package} or set(map(str, importers))
     return own or ({f"tests/{package}"} if Path("tests", package).is_dir() else set())
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from asked import prove_limiter
+from evaluate import prove_limiter
 from threadpoolctl import threadpool_limits
 
 from haptic_loop import certify, design_coupling

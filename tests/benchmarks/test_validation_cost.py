@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from asked import this_environment
+from evaluate import this_environment
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.tick import StepBuffer

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from worlds import PAIR, SOFT
+from shared import PAIR, SOFT
 
 from haptic_loop.cli.check import main
 from haptic_loop.cli.execute import execute

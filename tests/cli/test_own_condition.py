@@ -11,7 +11,7 @@ import pytest
 from haptic_loop import certify, design_coupling, load
 from haptic_loop.design.files import InputError
 from haptic_loop.hw.control import SafetyStop, certified_coupling
-from tests.asked import decisive
+from tests.evaluate import decisive
 
 PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
 NAME, OWN = "joined-devices", "joined_devices.py:JoinedDevices"

@@ -26,7 +26,7 @@ from haptic_loop.sim import run as loop
 from haptic_loop.sim.accuracy import CrossCheck
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
-from tests.asked import decisive, needs, safe_with
+from tests.evaluate import decisive, needs, safe_with
 
 SECTIONS = {"case", "scenario", "assessment", "stability"}
 SECTIONS |= {"run", "error", "files"}

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from hands import Hands
-from worlds import FIGURE_4
+from shared import FIGURE_4
 
 from haptic_loop import design_coupling
 from haptic_loop.controller.budget import EnergyBudget, Packets, Shell
@@ -148,7 +148,7 @@ def test_the_budget_holds_on_stiffer_springs():
 
 
 @pytest.mark.parametrize(
-    ("hold", "loss", "told"),
+    ("hold", "loss", "report"),
     [
         (3, 0.3, "late"),
         pytest.param(0, 0.0, "never", marks=pytest.mark.slow),
@@ -158,7 +158,7 @@ def test_the_budget_holds_on_stiffer_springs():
         ),
     ],
 )
-def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
+def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, report):
     """The budget learns which forces acted at once, four ticks late, or never."""
     rng, nsim = np.random.default_rng(8), 90
     hands = Hands(rng, nsim, True, 0.01)
@@ -171,9 +171,9 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
         [np.zeros((2, nsim))],
     )
     for k in range(500):
-        sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
+        sent = budget.limit(force(), hands.x - x, acted[-1] if report == "at once" else None)
         x = hands.x
-        if told == "late" and k > late:
+        if report == "late" and k > late:
             budget.tell(k - late, acted[k - late + 1])
         acted.append(line.carry(sent))
         hands.hold(acted[-1])
@@ -184,22 +184,22 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
     assert (np.abs(acted).sum(axis=(0, 1)) > 0.1).mean() > 0.6
 
 
-@pytest.mark.parametrize("told", [pytest.param("constant", marks=pytest.mark.slow), "late"])
-def test_coarse_encoders_keep_the_guarantee(told):
+@pytest.mark.parametrize("case", [pytest.param("constant", marks=pytest.mark.slow), "late"])
+def test_coarse_encoders_keep_the_guarantee(case):
     """No hand receives more than W0. If the budget ignores steps of 0.5 mm, one receives over 1.5 W0."""
     W0, q, most = 0.05, 5e-4, {}
-    for known in (q, 0.0) if told == "constant" else (q,):
+    for known in (q, 0.0) if case == "constant" else (q,):
         rng = np.random.default_rng(17)
         hands = Hands(rng, 40, True, 0.02)
         initial, steal = hands.energy(), thief(hands.x, rng)
-        lo, hi = ((0, 1), (0, 1)) if told == "constant" else ((0, 0), (2, 2))
+        lo, hi = ((0, 1), (0, 1)) if case == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, Packets(lo, hi), encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
         for k in range(500):
             now = np.round(hands.x / q) * q
             wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # changing forces cost energy behind coarse encoders
             sent = budget.limit(wanted, now - seen)
-            if told == "late" and k >= 3:
+            if case == "late" and k >= 3:
                 budget.tell(k - 3, acted[k - 3])
             seen = now
             acted.append(line.carry(sent))
@@ -207,12 +207,12 @@ def test_coarse_encoders_keep_the_guarantee(told):
             most[known] = max(most.get(known, 0.0), (hands.energy() - initial).max())
         assert np.abs(acted).sum() > 0
     assert most[q] <= W0 + 1e-9
-    if told == "constant":
+    if case == "constant":
         assert most[0.0] > 1.5 * W0
 
 
-@pytest.mark.parametrize("told", [1, 2])
-def test_encoder_errors_cost_their_worst_combination(told):
+@pytest.mark.parametrize("every", [1, 2])
+def test_encoder_errors_cost_their_worst_combination(every):
     """The device reports every tick or every second one; the worst errors of +-q/2 are found among all combinations.
 
     The previous force bounds the errors of a tick only if it was reported. Other ticks count with their largest loss.
@@ -224,13 +224,13 @@ def test_encoder_errors_cost_their_worst_combination(told):
     for k in range(ticks):
         sent = budget.limit(f[k + 1, :, None], dx[k, :, None])
         np.testing.assert_array_equal(sent[:, 0], f[k + 1])  # 1 J is enough for all forces
-        if k % told == 0:
+        if k % every == 0:
             budget.tell(k, f[k, :, None])
     damping = 0.95 * DELTA
     losses = T * f**2 / (4 * damping) + 2 * q * np.abs(f)
     losses[1:] = np.maximum(losses[1:], losses[:-1])  # the larger loss of the packets of both ages
-    energy = 1 - sum(losses[k].sum() for k in range(ticks) if k % told)
-    for run in [range(ticks)] if told == 1 else [[k] for k in range(0, ticks, told)]:
+    energy = 1 - sum(losses[k].sum() for k in range(ticks) if k % every)
+    for run in [range(ticks)] if every == 1 else [[k] for k in range(0, ticks, every)]:
         errors = q / 2 * np.array(list(product((-1, 1), repeat=len(run) + 1)))
         energy -= (np.diff(errors) @ f[run]).max(axis=0).sum()
         energy += (f[run] * dx[run] + damping * np.maximum(np.abs(dx[run]) - q, 0) ** 2 / T).sum()

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from worlds import FIGURE_4
+from shared import FIGURE_4
 
 from haptic_loop.controller.environment import GROUND, Network, Networks, Spring, Wall, environment, walled_environment
 

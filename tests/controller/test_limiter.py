@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from driven import drive, wander
-from worlds import FIGURE_4, STIFF, T, checkered, loop_of
+from shared import FIGURE_4, STIFF, T, checkered, loop_of
 
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.complementarity import BoxProblem

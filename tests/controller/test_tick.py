@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from worlds import FIGURE_4, force_map, loop_of
+from shared import FIGURE_4, force_map, loop_of
 
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall, environment

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from worlds import FIGURE_4, force_map
+from shared import FIGURE_4, force_map
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising

@@ -5,10 +5,10 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from asked import this_environment
 from driven import drive, wander
+from evaluate import this_environment
 from scipy.optimize import brentq
-from worlds import FIGURE_4, SOFT, force_map, loop_of
+from shared import FIGURE_4, SOFT, force_map, loop_of
 
 from haptic_loop.cli.accuracy import main as accuracy
 from haptic_loop.cli.run import main
@@ -30,7 +30,7 @@ from haptic_loop.models.scene import crowds, variants
 from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine
 from haptic_loop.sim.run import assemble, run, run_blocks
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
-from tests.asked import needs, safe_with
+from tests.evaluate import needs, safe_with
 
 T = 1e-3
 WALL = ("tip", GROUND)

@@ -5,7 +5,7 @@ from functools import cache
 
 import msgspec
 import pytest
-from worlds import ONE_MASS
+from shared import ONE_MASS
 
 from haptic_loop.cli.audit import main as audit
 from haptic_loop.cli.compare import main as compare
@@ -30,7 +30,7 @@ from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.scenario import load, parse
-from tests.asked import needs, safe_with
+from tests.evaluate import needs, safe_with
 
 ONE = parse(ONE_MASS)
 LOOP = ONE.loop("I")

@@ -9,7 +9,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from worlds import FIGURE_4, PAIR, SOFT
+from shared import FIGURE_4, PAIR, SOFT
 
 from haptic_loop.cli.audit import main
 from haptic_loop.cli.execute import execute
@@ -24,7 +24,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _remedies, audit, edge, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import ANY, CAVEATS, GUARD, suffices
-from tests.asked import needs, safe_with
+from tests.evaluate import needs, safe_with
 
 CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3

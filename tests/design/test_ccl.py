@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 import scipy.linalg
-from asked import any_environment, this_environment
-from worlds import DELTA, FIGURE_4, T, force_map
+from evaluate import any_environment, this_environment
+from shared import DELTA, FIGURE_4, T, force_map
 
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper

@@ -7,8 +7,8 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from asked import prove_limiter, this_environment
-from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
+from evaluate import prove_limiter, this_environment
+from shared import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from haptic_loop.controller import coupling as controller_coupling
 from haptic_loop.controller.arithmetic import SingularLoop, numbers, rational, solve

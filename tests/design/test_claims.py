@@ -9,9 +9,9 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from asked import any_environment, this_environment
 from driven import driven
-from worlds import FIGURE_4, SOFT, STIFF, force_map
+from evaluate import any_environment, this_environment
+from shared import FIGURE_4, SOFT, STIFF, force_map
 
 from haptic_loop.controller.arithmetic import numbers
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper

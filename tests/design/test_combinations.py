@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from worlds import block_by_hand, contact_by_hand, least_scaled
+from shared import block_by_hand, contact_by_hand, least_scaled
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall

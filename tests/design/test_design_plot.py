@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from worlds import FIGURE_4, PAIR, SOFT
+from shared import FIGURE_4, PAIR, SOFT
 
 from haptic_loop.cli.compare import main
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper

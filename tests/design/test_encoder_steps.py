@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from asked import this_environment
+from evaluate import this_environment
 from msgspec.structs import replace as change
-from worlds import FIGURE_4
+from shared import FIGURE_4
 
 from haptic_loop.cli.audit import main as audit_command
 from haptic_loop.cli.bridge import _certified

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from worlds import FIGURE_4, force_map
+from shared import FIGURE_4, force_map
 
 from haptic_loop.controller.arithmetic import SingularLoop, TooLong, inverse, numbers, rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper

@@ -12,7 +12,7 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
-from asked import (
+from evaluate import (
     any_environment_demand,
     limiter_demand,
     switching_demand,
@@ -20,7 +20,7 @@ from asked import (
     walls_demand,
 )
 from scipy.optimize import minimize_scalar
-from worlds import FIGURE_4, SOFT, STIFF, T, checkered
+from shared import FIGURE_4, SOFT, STIFF, T, checkered
 
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel

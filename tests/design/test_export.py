@@ -10,8 +10,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from asked import prove_limiter
-from worlds import FIGURE_4, PAIR, SOFT, T, checkered
+from evaluate import prove_limiter
+from shared import FIGURE_4, PAIR, SOFT, T, checkered
 
 from haptic_loop.cli.check import main as check
 from haptic_loop.cli.export import main

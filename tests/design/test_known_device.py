@@ -9,12 +9,12 @@ from functools import cache, partial
 import msgspec
 import numpy as np
 import pytest
-from asked import loop as loop_of
-from asked import this_environment
+from evaluate import loop as loop_of
+from evaluate import this_environment
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solveh_banded
 from scipy.optimize import brentq, minimize, minimize_scalar
-from worlds import PAIR, block_by_hand, contact_by_hand, least_scaled
+from shared import PAIR, block_by_hand, contact_by_hand, least_scaled
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall

@@ -3,10 +3,10 @@
 import msgspec
 import numpy as np
 import pytest
-from asked import latency_demand, this_environment, this_environment_demand
 from driven import growing
+from evaluate import latency_demand, this_environment, this_environment_demand
 from scipy.linalg import expm
-from worlds import FIGURE_4, ONE_MASS
+from shared import FIGURE_4, ONE_MASS
 
 from haptic_loop.controller.arithmetic import numbers
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper

@@ -5,8 +5,8 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from asked import limiter, limiter_demand, prove_limiter, this_environment
-from worlds import DELTA, PAIR, STIFF, T
+from evaluate import limiter, limiter_demand, prove_limiter, this_environment
+from shared import DELTA, PAIR, STIFF, T
 
 from haptic_loop.cli.design import main as design_main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper

@@ -3,8 +3,8 @@
 from functools import cache
 
 import pytest
-from asked import this_environment
-from worlds import force_map
+from evaluate import this_environment
+from shared import force_map
 
 from haptic_loop import certify, load, transparency_of
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling

@@ -4,8 +4,8 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import analysis, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
-from asked import any_environment
-from worlds import DELTA, FIGURE_4, T
+from evaluate import any_environment
+from shared import DELTA, FIGURE_4, T
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_demand, any_environment_per_channel, loop, this_environment
+from evaluate import any_environment, any_environment_demand, any_environment_per_channel, loop, this_environment
 from scipy.linalg import eig, eigh
-from worlds import FIGURE_4, STIFF, force_map
+from shared import FIGURE_4, STIFF, force_map
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment

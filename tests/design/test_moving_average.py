@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from asked import any_environment
+from evaluate import any_environment
 
 from haptic_loop import certify, design_coupling, simulate, transparency_of
 from haptic_loop import load as scenario_of

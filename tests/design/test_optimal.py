@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import scipy
-from asked import this_environment
+from evaluate import this_environment
 from scipy.optimize import minimize_scalar
 
 from haptic_loop.cli.compare import main as compare_main

@@ -5,7 +5,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT, STIFF
+from shared import PAIR, SOFT, STIFF
 
 from haptic_loop.cli import check
 from haptic_loop.controller.coupling import SpringDamper

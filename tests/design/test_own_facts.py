@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT, STIFF, checkered
+from shared import PAIR, SOFT, STIFF, checkered
 
 from haptic_loop import certify, load
 from haptic_loop.cli import check

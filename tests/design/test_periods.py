@@ -6,11 +6,11 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_demand, prove_limiter, this_environment_demand
-from asked import loop as loop_of
 from driven import growing
+from evaluate import any_environment, any_environment_demand, prove_limiter, this_environment_demand
+from evaluate import loop as loop_of
 from scipy.linalg import expm
-from worlds import FIGURE_4, ONE_MASS
+from shared import FIGURE_4, ONE_MASS
 
 from haptic_loop.cli.design import main as cli_design
 from haptic_loop.controller.coupling import SpringDamper

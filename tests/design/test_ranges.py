@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
-from worlds import FIGURE_4, ONE_MASS, environment_by_hand, filter_by_hand, force_map
+from shared import FIGURE_4, ONE_MASS, environment_by_hand, filter_by_hand, force_map
 
 from haptic_loop.cli.audit import main as audit_main
 from haptic_loop.cli.check import main as check_main
@@ -28,7 +28,7 @@ from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
-from tests.asked import decisive, safe_with
+from tests.evaluate import decisive, safe_with
 
 T, THETA = 1.2e-3, (2,)
 #: The spring at contact 1 may be softer, stiffer or absent: three vertices beside the environment.

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import scipy
 from analysis import analysis, solve
-from asked import any_environment, this_environment
+from evaluate import any_environment, this_environment
 from scipy.optimize import brentq, minimize, rosen, rosen_der
-from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
+from shared import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay

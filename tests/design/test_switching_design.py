@@ -5,7 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from asked import switching_sweep
+from evaluate import switching_sweep
 
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper

@@ -7,8 +7,8 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from asked import switching_demand, switching_sweep, this_environment
-from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, environment_by_hand, force_map
+from evaluate import switching_demand, switching_sweep, this_environment
+from shared import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, environment_by_hand, force_map
 
 from haptic_loop import certify
 from haptic_loop.cli.audit import main as audit_main

@@ -6,8 +6,8 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-from asked import switching_demand, switching_sweep, this_environment
-from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
+from evaluate import switching_demand, switching_sweep, this_environment
+from shared import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
 
 from haptic_loop.cli.audit import main
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper

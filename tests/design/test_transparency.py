@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from worlds import FIGURE_4, SOFT, STIFF, force_map
+from shared import FIGURE_4, SOFT, STIFF, force_map
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment

@@ -6,7 +6,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from asked import any_environment, this_environment
+from evaluate import any_environment, this_environment
 from scipy.linalg import expm
 
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel

@@ -6,7 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
+from shared import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from haptic_loop.cli.check import main as check_main
 from haptic_loop.controller.coupling import ForceFilter, _InternalModel

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from sessions import in_fork, strike
-from worlds import checkered
+from shared import checkered
 
 from haptic_loop.cli import bridge, identify, session_cli
 from haptic_loop.hw import boards, transport

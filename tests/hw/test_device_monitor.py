@@ -5,7 +5,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from worlds import FakePort, checkered
+from shared import FakePort, checkered
 
 from haptic_loop.design.files import plain
 from haptic_loop.hw.device_state import Device

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from sessions import in_fork, strike
-from worlds import checkered
+from shared import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.encoders import EncoderMonitor, EncoderNoise, EncoderTest, Expected

@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from worlds import FakePort
+from shared import FakePort
 
 from haptic_loop.cli import bridge, replay, session_cli
 from haptic_loop.cli.session_cli import check_link

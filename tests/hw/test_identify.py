@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from worlds import checkered
+from shared import checkered
 
 from haptic_loop.cli.identify import _sitting, _table
 from haptic_loop.cli.identify import main as identify_command

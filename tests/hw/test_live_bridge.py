@@ -36,7 +36,7 @@ from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError
-from tests.asked import decisive
+from tests.evaluate import decisive
 from tests.pseudo_terminal import EmulatorProcess, emulated
 from tests.sessions import rehearsal_of
 

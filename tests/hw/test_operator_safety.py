@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from worlds import FakePort
+from shared import FakePort
 
 from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser

@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import InputError, parse
 from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.trace import Trace
-from tests.asked import decisive
+from tests.evaluate import decisive
 
 
 def test_missing_samples_are_filled_by_a_straight_line():

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from scipy.optimize import brentq
 from sessions import AT_REST, FAST, in_fork, rehearsal_of, session_with, strike
-from worlds import FakePort
+from shared import FakePort
 
 from haptic_loop.cli import bridge
 from haptic_loop.cli import replay as replay_command

@@ -5,7 +5,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from worlds import environment_by_hand
+from shared import environment_by_hand
 
 from haptic_loop.controller.coupling import MovingAverage, SpringDamper
 from haptic_loop.controller.environment import Network, Spring

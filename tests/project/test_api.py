@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from worlds import SOFT
+from shared import SOFT
 
 import haptic_loop
 from haptic_loop import (
@@ -42,7 +42,7 @@ from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import SCENARIOS
 from haptic_loop.sim.switching import switching
-from tests.asked import safe_with
+from tests.evaluate import safe_with
 
 SHORT = load().replace(duration=0.3)
 

@@ -9,7 +9,7 @@ import pytest
 
 from haptic_loop.cli.main import COMMANDS, _command
 from haptic_loop.cli.options import DOES_NOT_HOLD, DONE
-from tests.asked import decisive
+from tests.evaluate import decisive
 
 LAB = str(Path(__file__).parents[2] / "examples/lab.toml")
 DESIGNS = [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from driven import driven
 from scipy.optimize import brentq
-from worlds import STIFF
+from shared import STIFF
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.design.certificate import requirements_of

@@ -8,9 +8,9 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from asked import prove_limiter
 from driven import tick_by_tick
-from worlds import SOFT, STIFF
+from evaluate import prove_limiter
+from shared import SOFT, STIFF
 
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import SpringDamper

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from worlds import VERTICES_ONLY
+from shared import VERTICES_ONLY
 
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.options import DONE

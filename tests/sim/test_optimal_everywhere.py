@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from worlds import VERTICES_ONLY
+from shared import VERTICES_ONLY
 
 from haptic_loop.cli import export, run, validate
 from haptic_loop.controller.coupling import ForceFilter, _InternalModel

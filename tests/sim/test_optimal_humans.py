@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from worlds import checkered
+from shared import checkered
 
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.models.scene import Crowd, Variants, draw, variants

@@ -11,7 +11,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from worlds import VERTICES_ONLY, checkered
+from shared import VERTICES_ONLY, checkered
 
 from haptic_loop import certify, design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command

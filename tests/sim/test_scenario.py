@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from worlds import FIGURE_4
+from shared import FIGURE_4
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring

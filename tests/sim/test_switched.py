@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from worlds import SOFT, STIFF
+from shared import SOFT, STIFF
 
 from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
@@ -37,7 +37,7 @@ from haptic_loop.sim.switching import (
     switched_crowd,
     switching,
 )
-from tests.asked import decisive
+from tests.evaluate import decisive
 
 ASSEMBLY = assemble(load(), STIFF)
 

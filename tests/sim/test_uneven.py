@@ -30,8 +30,8 @@ from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from haptic_loop.sim.run import assemble, make_engine, outside_forces, run
 from haptic_loop.sim.stability import Balance, close, dominant_mode, stability_of, verdict_within
 from haptic_loop.sim.switching import switching
-from tests.asked import needs
 from tests.checks import uneven
+from tests.evaluate import needs
 
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])  # the design for any environment, rounded
 PAIR = load("omega-pair").replace(duration=0.3)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hands import Hands
 from msgspec.structs import replace
-from worlds import checkered
+from shared import checkered
 
 from haptic_loop import design_coupling, simulate
 from haptic_loop.controller.budget import Shell

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from driven import drive
-from worlds import force_map, loop_of
+from shared import force_map, loop_of
 
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.execute import execute

@@ -162,9 +162,9 @@ def block_by_hand(z, T, theta, contact, cost, beta=0.0, wall=None, limiter=None)
     moved = dx + (beta * (z - 1) * of["v"] if "v" in of else 0)
     terms.append((moved, z**-theta * sent))
     inputs = np.stack([dx, of["v"]] if "v" in of else [dx], axis=1)
-    whole = sum(np.conj(one)[:, :, None] * other[:, None] for one, other in terms)
-    whole = (whole + np.conj(np.swapaxes(whole, 1, 2))) / 2
-    return whole + np.conj(np.swapaxes(inputs, 1, 2)) @ cost @ inputs
+    block = sum(np.conj(one)[:, :, None] * other[:, None] for one, other in terms)
+    block = (block + np.conj(np.swapaxes(block, 1, 2))) / 2
+    return block + np.conj(np.swapaxes(inputs, 1, 2)) @ cost @ inputs
 
 
 def least_scaled(block: np.ndarray) -> float:
