@@ -187,8 +187,12 @@ class Measurement:
         tick = self._tick + distance(state.echo, state.tick)
         if self._sent is None:
             self._note_all(tick, margin, missed, passed)
-        elif margin is not None and tick in self._sent:
-            self._answers.by_tick[tick] = self._answers.age(margin)
+        else:
+            if margin is not None and tick in self._sent:
+                self._answers.by_tick[tick] = self._answers.age(margin)
+            if not missed:  # An answer without an age has come, too: the STATE with its age was lost.
+                latched = self._tick - self._theta
+                self._sent -= {t for t in range(latched - passed + 1, latched + 1) if t not in self._answers.by_tick}
         ages, needed = self._answers.by_tick, self._needed if self._sent is None else -(-self._needed // 2)
         everything, counted = len(ages) + self._missing, counted // (2 * self._apart - 1)
         if everything < needed and counted < _STATES_PER_ANSWER * needed:

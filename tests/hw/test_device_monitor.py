@@ -450,6 +450,14 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
     assert rounds > 2
 
 
+def test_lost_states_are_no_lost_answers(scenario):
+    """A twentieth of the STATEs is lost, and with each its answer. A lost report of an answer's age is no lost answer."""
+    session, _, exact = measured(scenario, (FaultInjection.parse("up:drop=0.05"),), 1000)
+    ages = session.measurement.result
+    assert exact is not None  # the second round
+    assert ages.missing / (len(ages.values) + ages.missing) == pytest.approx(0.05, abs=0.02)
+
+
 def test_ages_while_forces_act_count_skipped_answers(scenario):
     """Every 4 ms four answers arrive together; the next STATE reports only the age of the youngest."""
     scenario, faults = scenario.replace(T=1e-3), (FaultInjection.parse("burst=0.004"),)
