@@ -120,7 +120,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             for i, n in enumerate(value or (), start=1):
                 require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
-            many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
+            each = f"theta {list(self.theta)} and psi {list(self.psi)} of the channels"
+            many = f"{each} are {total} samples in all, allowed are {_MOST_DELAYS}"
             seconds = f"each sample is a state, and the eigenvalues would take about {1e-9 * total**3:.0f} s"
             raise ValueError(f"{many}: {seconds}; a longer T has fewer samples for the same delay")
         for i, lam in enumerate(self.lam or ()):
