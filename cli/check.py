@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.ranges import where_proved
-from haptic_loop.controller.units import speak
+from haptic_loop.controller.units import set_unit
 from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
 from haptic_loop.design.certificate import (
     NotProved,
@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
-    speak(stored.loop.unit)
+    set_unit(stored.loop.unit)
     with options.refused(f"{args.coupling}: "):
         own = named(args.condition) if args.condition else None
         anew = own is not None and not (stored.certificate and stored.certificate.condition == own.name)

@@ -15,7 +15,7 @@ import numpy as np
 from haptic_loop.cli import options, render
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.units import comments_in_unit, speak
+from haptic_loop.controller.units import comments_in_unit, set_unit
 from haptic_loop.design.certificate import Verdict, named, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.designs import name_and_own
@@ -68,7 +68,7 @@ def main(argv: list[str]) -> int:
     """Export a stored coupling. Return 1 if its file has a certificate that does not hold, else 0."""
     args = _parser().parse_args(argv)
     stored = read_coupling(args.coupling)
-    speak(stored.loop.unit)
+    set_unit(stored.loop.unit)
     own = name_and_own(args.condition)[1]
     try:
         verdict = verify(stored, args.condition and named(args.condition))

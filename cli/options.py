@@ -21,7 +21,7 @@ import msgspec
 
 from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
-from haptic_loop.controller.units import speak
+from haptic_loop.controller.units import set_unit
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, DesignFailed
@@ -129,7 +129,7 @@ class Parser(argparse.ArgumentParser):
         scenarios = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         scenarios.add_argument("--scenario", default=DEFAULT)
         with suppress(argparse.ArgumentError, InputError):
-            speak(load(scenarios.parse_known_args(self._words)[0].scenario).unit)
+            set_unit(load(scenarios.parse_known_args(self._words)[0].scenario).unit)
         if choice := _CHOICE.fullmatch(message):
             allowed = choice[3].replace("'", "")
             raise InputError(f"{choice[1]} is {choice[2]}, allowed are {allowed}")
@@ -447,7 +447,7 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """Return the scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
-    speak(scenario.unit)
+    set_unit(scenario.unit)
     if (args.reference or args.case == "II") and (args.lam or scenario.lam is not None):
         option = f"--reference {args.reference}" if args.reference else "--case II"
         raise InputError(f"{option} with {'--lam' if args.lam else 'lam of the scenario'}: both set the reference")

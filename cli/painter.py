@@ -78,9 +78,9 @@ class Painter:
         if self._process and self._process.stdin:
             import pickle
 
-            from haptic_loop.controller.units import spoken
+            from haptic_loop.controller.units import current_unit
 
-            request = pickle.dumps((spoken(), function, arguments), pickle.HIGHEST_PROTOCOL)
+            request = pickle.dumps((current_unit(), function, arguments), pickle.HIGHEST_PROTOCOL)
             stdin, self._process.stdin = self._process.stdin, None  # communicate() must not use the closed pipe
             with suppress(BrokenPipeError), stdin:
                 stdin.write(request)
@@ -119,12 +119,12 @@ def _serve() -> None:
     reader.start()
     os.environ["MPLBACKEND"] = "Agg"
     skip_docstrings()
-    from haptic_loop.controller.units import speak
+    from haptic_loop.controller.units import set_unit
     from haptic_loop.sim import plots
 
     reader.join()
     unit, function, arguments = pickle.loads(request)
-    speak(unit)
+    set_unit(unit)
     sys.stdout.buffer.write(plots.png(getattr(plots, function)(*arguments)))
     sys.stdout.flush()
     os._exit(0)  # Skip Python's clean-up, for which the first process would wait.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from haptic_loop.cli import options, render
-from haptic_loop.controller.units import speak_of
+from haptic_loop.controller.units import set_unit_of
 from haptic_loop.hw.recording import load, replay
 
 
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
     parser.add_json()
     args = parser.parse_args(argv)
     result, link = load(Path(args.trace))
-    speak_of(result.meta)
+    set_unit_of(result.meta)
     compared = replay(result, link)
     different = compared.asked | compared.sent
     report = _Compared(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from haptic_loop.cli import options, render
-from haptic_loop.controller.units import speak_of
+from haptic_loop.controller.units import set_unit_of
 from haptic_loop.design.files import check_file
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
@@ -30,7 +30,7 @@ def main(argv: list[str]) -> int:
     if args.plot is not None:
         check_file("--plot", Path(args.plot))
     result = Trace.load_npz(Path(args.trace))
-    speak_of(result.meta)
+    set_unit_of(result.meta)
     rates = growths(result)
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")

@@ -237,7 +237,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) [N] of tick `tick`, counted from 0. Raises ValueError if none are due for it."""
+        """Report the forces (m, nsim) [N] of a tick, counted from 0. Raises ValueError if it waits for no report."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))

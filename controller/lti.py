@@ -150,7 +150,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """The number of core states, without delay lines at the outputs, which cost little time in a response."""
+        """The number of core states. Delay lines at the outputs do not count: they cost little time in a response."""
         return self._lines[0].size
 
     @property

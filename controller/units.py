@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from typing import Any, Literal
 
 PositionUnit = Literal["m", "rad"]
-_spoken: ContextVar[PositionUnit] = ContextVar("unit", default="m")
+_current: ContextVar[PositionUnit] = ContextVar("unit", default="m")
 #: the rotary unit for each unit in a text; the single letters of _ALONE are units only directly after "[", or after a
 #: digit or closing bracket and one space
 _ROTARY = {"N s/m": "N m s/rad", "N/m": "N m/rad", "m/N": "rad/(N m)", "m/s": "rad/s", "kg": "kg m2"}
@@ -26,29 +26,29 @@ _KEY = re.compile(r"_(n_per_m|mm|um|m|n|N)$")
 _KEYS = {"n_per_m": "nm_per_rad", "mm": "mrad", "um": "urad", "m": "rad", "n": "nm", "N": "Nm"}
 
 
-def speak(unit: PositionUnit) -> None:
+def set_unit(unit: PositionUnit) -> None:
     """Set the unit of this command's output."""
-    _spoken.set(unit)
+    _current.set(unit)
 
 
-def speak_of(meta: Any) -> None:
+def set_unit_of(meta: Any) -> None:
     """Set the unit of this command's output to that of a stored trace with these meta data."""
-    speak("rad" if isinstance(meta, dict) and meta.get("unit") == "rad" else "m")
+    set_unit("rad" if isinstance(meta, dict) and meta.get("unit") == "rad" else "m")
 
 
-def spoken() -> PositionUnit:
+def current_unit() -> PositionUnit:
     """Return the unit of this command's output."""
-    return _spoken.get()
+    return _current.get()
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
     """Return `text` with rotary units if `unit` (default: this command's) is rad. A second call changes nothing."""
-    return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
+    return _WORDS.sub(_rotary, text) if (unit or current_unit()) == "rad" else text
 
 
 def with_unit(meta: dict[str, Any]) -> dict[str, Any]:
     """Return a trace's meta data, with "unit" if positions are in radians."""
-    return meta | {"unit": "rad"} if spoken() == "rad" else meta
+    return meta | {"unit": "rad"} if current_unit() == "rad" else meta
 
 
 def comments_in_unit(source: str) -> str:
@@ -66,7 +66,7 @@ def _rotary(match: re.Match[str]) -> str:
 
 def keys_in_unit(report: Any) -> Any:
     """Return plain data with keys and texts in this command's unit: encoder_step_m becomes encoder_step_rad."""
-    if spoken() == "m":
+    if current_unit() == "m":
         return report
     if isinstance(report, dict):
         return {_KEY.sub(lambda key: f"_{_KEYS[key[1]]}", k): keys_in_unit(value) for k, value in report.items()}

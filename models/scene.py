@@ -427,8 +427,8 @@ def _per_channel(device: Device, name: str) -> list[float]:
     return [getattr(channel, name) for channel in device.channels()]
 
 
-def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], drawn: bool = True) -> Scene:
-    """Compile the scene. Without `drawn` its `xml` is empty, which saves half of the time."""
+def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], with_xml: bool = True) -> Scene:
+    """Compile the scene. Without `with_xml` its `xml` is empty, which saves half of the time."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -468,7 +468,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], drawn: bool 
                 places = [number[joints[k]], number[base[k]] if base else -1]
                 spec.add_numeric(name=f"{_IMPEDANCE}{i}{axis}", data=[*places, *numbers], size=len(numbers) + 2)
     xml = ""
-    if drawn:
+    if with_xml:
         spec.compile()
         xml = written(spec)
     for part in [*(tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)), *spec.sites]:
@@ -824,7 +824,7 @@ def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     """
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)
-    scene = _compiled(devices, first, drawn=False)
+    scene = _compiled(devices, first, with_xml=False)
     model = scene.model
     names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
     fields = {name: np.tile(getattr(model, name).astype(float), (len(crowd), 1)) for name in names}

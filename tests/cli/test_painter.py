@@ -13,7 +13,7 @@ import pytest
 
 from haptic_loop.cli import painter as painter_module
 from haptic_loop.cli.painter import Painter, begin
-from haptic_loop.controller.units import speak, spoken
+from haptic_loop.controller.units import current_unit, set_unit
 from haptic_loop.sim import plots
 from haptic_loop.sim.shown import Signals
 
@@ -25,19 +25,19 @@ SHOWN = Signals(T, 1e-3 * WAVE, WAVE, 1e-3 * WAVE, ("knob",)), "a turn", 5.0
 
 @pytest.fixture
 def in_radians():
-    before = spoken()
-    speak("rad")
+    before = current_unit()
+    set_unit("rad")
     yield
-    speak(before)
+    set_unit(before)
 
 
 PROGRAM = """
 import pickle, sys
 from pathlib import Path
-from haptic_loop.controller.units import speak
+from haptic_loop.controller.units import set_unit
 from haptic_loop.cli.painter import Painter
 
-speak("rad")
+set_unit("rad")
 painter = Painter()
 painter.ask("draw_run", *pickle.load(sys.stdin.buffer))
 painter.save(Path(sys.argv[1]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from haptic_loop import certify, design_coupling, simulate
-from haptic_loop.controller.units import in_unit, keys_in_unit, speak
+from haptic_loop.controller.units import in_unit, keys_in_unit, set_unit
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.session import session_for
 from haptic_loop.sim.couplings import read_coupling
@@ -23,7 +23,7 @@ LINEAR = re.compile(r"N s/m|N/m\b|m/N|(?<!\w)[mu]m\b|(?<!\w)m/s|kg(?! m2)|\d N(?
 @pytest.fixture(autouse=True)
 def _metres():
     yield
-    speak("m")
+    set_unit("m")
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_texts_take_the_rotary_units(linear, rotary):
 
 
 def test_keys_take_the_rotary_units():
-    speak("rad")
+    set_unit("rad")
     report = {
         "encoder_step_m": [1.0],
         "peak_force_N": 2.0,
@@ -89,7 +89,7 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
         ("bridge", "--rehearse", "--duration", "0.3", "--measure", "60", "--out", str(out), "--no-plot"),
         ("trace", str(out / "trace.npz"), "--plot", str(tmp_path / "trace.svg")),
     ):
-        speak("m")
+        set_unit("m")
         of = [] if command in ("check", "export", "trace") else ["--scenario", str(WHEEL)]
         assert import_module(f"haptic_loop.cli.{command}").main([*words, *of]) == 0
         report = out / "report.json"
