@@ -457,15 +457,12 @@ def named(condition: str | Condition) -> Condition:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """Return the requirement of a condition: the least multiple of all devices' damping, by a refined sweep.
+    """Return the requirement of a condition, by a refined sweep.
 
     If `multiplier` is None, the condition chooses the multiplier. With ranges, a condition on the environment returns
     the largest requirement of all members. The requirement of a singular loop is infinite.
     """
-    requirement = named(condition).judge(loop, coupling, multiplier)
-    if requirement.reason:
-        return requirement
-    return replace(requirement, required=tuple(requirement.ratio * d for d in requirement.available))
+    return named(condition).judge(loop, coupling, multiplier)
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:

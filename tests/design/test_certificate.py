@@ -46,6 +46,13 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
     return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
+def test_channels_without_cross_terms_need_their_own_damping():
+    """With B = 0 any-environment needs K T (theta + 1)^2/2 per channel: 0.96 and 0.54 N s/m."""
+    coupling = SpringDamper([400.0, 100.0], [0.0, 0.0])
+    assert prove(DEFAULT, coupling, "any-environment").required == pytest.approx((0.96, 0.54), rel=1e-9)
+    assert required_damping(DEFAULT, coupling, "any-environment").required == pytest.approx((0.96, 0.54), rel=1e-9)
+
+
 @pytest.mark.parametrize("psi", [pytest.param((1, 1), marks=pytest.mark.validate), (1, 0)])
 def test_loops_with_psi_are_proved_with_phi(psi):
     """With psi = 1 in a channel, Theorem 4 needs a large enough Phi and guarantees this environment only."""
