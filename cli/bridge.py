@@ -63,7 +63,9 @@ def main(argv: list[str]) -> int:
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         choice = args.case, args.coupling, args.condition
-        programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
+        budget = args.energy_budget and args.energy_budget[0]
+        energies = {"start": start, "energy_budget": budget}
+        programs = certified_couplings(met, *choice, link, limiter=args.limiter, behind=behind, **energies)
         steps = session.units.encoder_step
         programs = [_counted(program, steps) for program in programs]
         render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
@@ -159,7 +161,7 @@ def _print_certificate(
     console.print(
         f"answers are {at[50]} us old (median), {at[99]} us at the 99th percentile, {ages.missing} of "
         f"{len(ages.values) + ages.missing} never arrived; "
-        f"the loop is certified for {_link(link, programs[0].scenario)}"
+        f"the certificate is for {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")

@@ -160,13 +160,14 @@ class SentBudget:
         """Upper bound [J] of the energy that the forces sent so far take from W0; at least 0."""
         return max(0.0, self.plan.start - float((self._budget.energy - self._budget.reserved)[0]))
 
-    def figures(self) -> BudgetFigures:
-        """Return the figures of the budget since arming."""
-        loss = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
-        dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
+    def figures(self, assessment: Assessment | None) -> BudgetFigures:
+        """Return the figures of the budget since arming, with the guarantee of the assessment that includes it."""
+        stated = assessment and assessment.guarantee
+        if stated is None or stated.energy_J != self.plan.start:
+            return self._budget.figures("no guarantee: the coupling was assessed without this energy budget")
         # A longer tick dissipates less than the budget credits, so that its energy has no bound.
-        ticks = f"while no tick lasts longer than {1e3 * self.plan.T:.4g} ms"
-        return self._budget.figures(f"no passive hand is given {loss} {dissipated}, {ticks}")
+        ticks = f"in an arming in which no tick lasts longer than {1e3 * self.plan.T:.4g} ms"
+        return self._budget.figures(f"{stated.words}, {ticks}")
 
 
 class WorldController:
@@ -489,9 +490,6 @@ class Armable(Protocol):
     def controller(self, cap: Sequence[float]) -> Controller: ...  # return a new controller for `cap` (m,) [N]
 
 
-_LATE = "no certificate covers a force that the device holds because an answer is late"
-
-
 @dataclass(frozen=True, eq=False)
 class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
@@ -552,9 +550,10 @@ class CertifiedCoupling:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             facts = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
             facts += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
-            return [*said, f"forces act as they come: certified for {facts}, as measured", _LATE]
-        if self.held < 1:
-            return [*said, _LATE]
+            return [*said, f"forces act as they come: certified for {facts}, as measured"]
+        budgeted = self.assessment.force_limits.energy_budget is not None  # The budget counts held forces itself.
+        if self.held < 1 or budgeted:
+            return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
         rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # rho of the limiter in the file's proof
         below = "" if rho and rho == self.assessment.force_limits.rho else " while forces stay below their limits"
@@ -571,12 +570,15 @@ def certified_coupling(
     limiter: bool | None = None,
     start: float = START_J,
     behind: tuple[int, ...] = (),
+    energy_budget: float | None = None,
 ) -> CertifiedCoupling:
     """Return the coupling `name`, or the user's coupling `own`, certified for a link of `link` ticks (0: on arrival).
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
-    them, with W0 = `start` [J]. With several boards, forces act `behind` (m,) ticks later than `link`, and each board
-    has its own clock. The longest period that the certificate covers is then longer by the share CLOCK_TOLERANCE.
+    them, with W0 = `start` [J]. Elsewhere they may have an `energy_budget` [J]; the coupling must be certified without
+    it, and the guarantee is that of the budget. With several boards, forces act `behind` (m,) ticks later than `link`,
+    and each board has its own clock. The longest period that the certificate covers is then longer by the share
+    CLOCK_TOLERANCE.
 
     Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """
@@ -603,7 +605,12 @@ def certified_coupling(
     if not certified.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(certified)}")
-    return certified
+    if energy_budget is None or is_world(alone):
+        return certified
+    assessment = assessed(alone, case, chosen, energy_budget=energy_budget, limiter=limiter)
+    if assessment.guarantee is None:
+        raise SafetyStop(f"with an energy budget the coupling is not certified: {assessment.reason}")
+    return replace(certified, assessment=assessment)
 
 
 def certified_couplings(

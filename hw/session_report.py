@@ -204,7 +204,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         _Link.of(session, recorder, dropped),
         ran,
         grown,
-        [arming.budget.figures() for arming in session.armings if arming.budget] or None,
+        [arming.budget.figures(coupled and coupled.assessment) for arming in session.armings if arming.budget] or None,
         worlds,
         SceneRecord.of(session.worlds[0].port.world) if session.worlds else None,
     )

@@ -280,12 +280,15 @@ class DelaysCovered:
         loop = scenario.loop("I").switching(span)  # the case does not matter to stability
         on_file = on_file if on_file and on_file.contains(span) else None
         figures = SwitchingFigures.of(loop, assessment.coupling, assessment.requirements.get(SWITCHING.name))
-        lossy = scenario.loses_packets
+        lossy, stated = scenario.loses_packets, assessment.guarantee
+        if stated and stated.proof == "account":
+            return cls(True, "the energy account covers them", figures, on_file)
         if proof := _how_proved(figures, on_file):
-            cover = "any switching of the delays within their range is covered"
-            losses = ", but not forces that lost packets make older than hi" if lossy else ""
-            words = f"certified for switching delays in this environment ({proof}): {cover}{losses}"
-            return cls(not lossy, words, figures, on_file)
+            cover = "any switching of the delays within their range"
+            words = f"certified for switching delays in this environment ({proof}): {cover} is covered"
+            if stated is None:
+                words = f"not covered: {assessment.reason}; otherwise {cover} would be ({proof})"
+            return cls(stated is not None, words, figures, on_file)
         buffered = figures.playout is not None and figures.playout.certified
         verdict = "for which the coupling is certified" if buffered else "which no certificate covers either"
         constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")

@@ -332,6 +332,10 @@ def test_rehearsals_have_a_sessions_stages_and_files(rehearsed):
     assert report["link"]["missed_percent"] == 0
     (budget,) = report["energy_budget"]  # it limits nothing while the coupling is certified
     assert (budget["start_J"], budget["limited_ticks"], budget["ticks"]) == (0.01, 0, report["run"]["samples"])
+    stated = report["assessment"]["guarantee"]  # The budget may scale forces, which no condition covers.
+    assert (stated["condition"], stated["energy_J"]) == ("energy-budget", 0.01)
+    assert budget["guarantee"].startswith(stated["words"])
+    assert "no tick lasts longer than 1.2" in budget["guarantee"]
     assert replay.main([str(out / "trace.npz")]) == 0
 
 

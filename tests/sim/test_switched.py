@@ -296,6 +296,9 @@ def test_lost_packets_leave_only_a_budgets_guarantee():
     assert alone.guarantee is None
     assert "a lost packet makes a force older" in alone.reason
     assert budgeted.guarantee.energy_J == 0.0
+    covered = [DelaysCovered.of(lossy, assessment) for assessment in (alone, budgeted)]
+    assert [each.covered for each in covered] == [False, True]
+    assert not any(each.covers.startswith("certified") for each in covered)
 
 
 def test_a_lost_packet_holds_the_last_force():
