@@ -239,7 +239,7 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
         console.print(f"energy budget, arming {i}: limited {part.limited_ticks} of {part.ticks} ticks")
         console.print(f"  {part.guarantee}")
     for i, part in enumerate(report.world or [], start=1):
-        claim = Claim.of(report.assessment).words if report.assessment else "No guarantee."
+        claim = Claim.of(report.assessment, ran=part).words if report.assessment else "No guarantee."
         acted = f"The shell acted on {part.ticks_acted} of {part.ticks} ticks."
         console.print(f"world, arming {i}: {claim} The encoder steps of the devices are not covered. {acted}")
         if part.unsettled_steps:

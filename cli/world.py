@@ -169,9 +169,12 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
     trace = finished.trace
     figures = trace.net.figures() if trace.net else None
     assert isinstance(figures, WorldFigures)
+    claim = Claim.of(report.assessment, chosen.certified_for, record := WorldRecord.of(figures))
     report = replace(
         report,
-        world=WorldRecord.of(figures),
+        guaranteed=claim.guaranteed,
+        guarantee=claim.words,
+        world=record,
         peak_force_N=np.abs(trace.f).max(axis=0, initial=0.0).tolist(),
         interrupted=trace.interrupted,
         wall_s=time.perf_counter() - began,
@@ -229,8 +232,12 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         hands = thrown(scenario, chosen.coupling, args.humans, args.seed, args.duration, START_J, move)
     worst = max(hands, key=lambda each: each.excess_J)
     holds = worst.excess_J <= 0
+    most = max((WorldRecord.of(each.figures) for each in hands), key=lambda each: (each.diverged, each.released_J))
+    claim = Claim.of(report.assessment, chosen.certified_for, most)
     report = replace(
         report,
+        guaranteed=claim.guaranteed,
+        guarantee=claim.words,
         world=WorldRecord.of(max(hands, key=lambda each: each.figures.limited_ticks).figures),
         hands=len(hands),
         worst_excess_J=worst.excess_J,

@@ -202,8 +202,9 @@ def simulate(
         from haptic_loop.sim.world import Claim, InWorld, SceneRecord, WorldRecord
 
         assert isinstance(trace.net, InWorld)
-        stated, scene = Claim.of(assessment, chosen.certified_for), SceneRecord.of(trace.net.ports[0].world)
-        meta |= {"world": plain(WorldRecord.of(trace.net.figures())), "scene": plain(scene)}
+        record, scene = WorldRecord.of(trace.net.figures()), SceneRecord.of(trace.net.ports[0].world)
+        stated = Claim.of(assessment, chosen.certified_for, record)
+        meta |= {"world": plain(record), "scene": plain(scene)}
         meta |= {"guarantee": stated.words, "guaranteed": stated.guaranteed}
     return replace(trace, meta=meta)
 

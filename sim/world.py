@@ -70,6 +70,11 @@ class WorldRecord:
         shared = {name: getattr(figures, name) for name in cls.__dataclass_fields__ if name != "ticks_acted"}
         return cls(ticks_acted=figures.limited_ticks, **shared)
 
+    @property
+    def diverged(self) -> bool:
+        """Whether MuJoCo warned of a number in the scene that is huge or not finite."""
+        return any("unstable" in text for text in self.warnings)
+
 
 @dataclass(frozen=True)
 class SceneRecord:
@@ -96,17 +101,23 @@ class Claim:
     words: str
 
     @classmethod
-    def of(cls, assessment: Assessment, certified_for: Network | None = None) -> Claim:
-        """Return the claim of the assessed run; without a guarantee it names the network `certified_for`, if any."""
+    def of(cls, assessment: Assessment, certified_for: Network | None = None, ran: WorldRecord | None = None) -> Claim:
+        """Return the claim of the assessed run; without a guarantee it names the network `certified_for`, if any.
+
+        After the run, `ran` adds W0 and the released energy. If the scene diverged, there is no guarantee.
+        """
         guarantee = assessment.guarantee
+        if ran and ran.diverged:
+            return cls(False, "No guarantee: the scene diverged, so that the energy it released is no bound.")
         if guarantee is None or guarantee.energy_J is None:
             return cls(False, f"No guarantee: {assessment.reason}.{_elsewhere(assessment, certified_for)}")
         energy = f"W0 = {_energy(guarantee.energy_J)}"
+        total = f", here at most {_energy(guarantee.energy_J + ran.released_J)} in all" if ran else ""
         swept = " A refined sweep shows this, without an exact proof." if guarantee.proof == "sampled" else ""
         return cls(
             True,
             f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
-            f"released.{swept}",
+            f"released{total}.{swept}",
         )
 
 
@@ -120,7 +131,7 @@ def _elsewhere(assessment: Assessment, network: Network | None) -> str:
 
 
 def _energy(joules: float) -> str:
-    return f"{1e3 * joules:g} mJ"
+    return f"{1e3 * joules:.4g} mJ" if joules < 1 else f"{joules:.4g} J"
 
 
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:

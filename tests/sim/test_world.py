@@ -309,6 +309,35 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
     assert "encoder steps" in simulate(coarse, certified(coarse), engine="exact").meta["guarantee"]
 
 
+def alone(folder: Path, stiffness: float, **changes) -> Scenario:
+    """Return a scene in which 1 kg slides along z, apart from the contacts, on a spring of `stiffness` [N/m]."""
+    mass = f'<joint type="slide" axis="0 0 1" stiffness="{stiffness}"/><geom size="0.05" mass="1"/>'
+    bodies = f'<body name="left">{TIP}</body><body name="right" pos="1 0 0">{TIP}</body><body pos="0 2 0">{mass}</body>'
+    return scenario(folder, f"<mujoco><worldbody>{bodies}</worldbody></mujoco>", **changes)
+
+
+def test_a_guarantee_names_its_bound_in_joules(tmp_path):
+    """In 0.2 s a free fall of 1 kg releases m (g t)^2 / 2 = 1.92 J, which a hand could be given."""
+    loop = alone(tmp_path, 0.0, duration=0.2)
+    words = simulate(loop, certified(loop)).meta["guarantee"]
+    bound = float(words.partition(", here at most ")[2].partition(" J in all")[0])
+    assert bound == pytest.approx(START_J + (9.81 * 0.2) ** 2 / 2, rel=0.02)  # the sums of a step differ by g T
+
+
+def test_a_scene_that_diverges_has_no_guarantee(tmp_path, capsys):
+    loop = alone(tmp_path, -1e9, duration=0.2)
+    meta = simulate(loop, certified(loop)).meta
+    assert not meta["guaranteed"]
+    assert meta["guarantee"].startswith("No guarantee: the scene diverged")
+    words = ["--scenario", str(tmp_path / "loop.toml"), "--out", str(tmp_path / "out")]
+    for run in (
+        ["run", "--duration", "0.2", "--no-plot"],
+        ["validate", "--duration", "0.2", "--no-plot", "--humans", "2"],
+    ):
+        _, shown = command(capsys, *run, *words)
+        assert shown.startswith("No guarantee: the scene diverged")
+
+
 def test_steps_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
     """If no step may be repeated, the counted steps are the ticks on which a force is at its limit."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
