@@ -3,14 +3,14 @@
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
 The log-det barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is
-strictly feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k. A
-Newton step is a least-squares problem in the directions S^-1/2 dS S^-1/2, where dS is the change of S.
+strictly feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k.
+`follow` steps along this path by power series, because products cost little beside the factor of a Hessian.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -24,9 +24,12 @@ from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
 _CENTRED = 0.5  # largest squared Newton decrement of a point that counts as the minimiser x(t)
-_STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
-_KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
-_LONGEST = 1e3  # largest step, in Newton steps, if no eigenvalue of S falls
+_STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a step, and of each of its products
+_ORDER = 6  # terms of the series: with 4 terms, n6 and n7 of benchmarks/loops take 5 to 10 % more steps
+_KEPT = 0.05  # least share of every eigenvalue of S that remains after a step to a larger t
+_DESCENT = 0.1  # least decrease of the barrier function in a step to the same t, relative to its slope at the start
+_FAR = 10.0  # A point with a larger squared Newton decrement, relative to the degree, is moved at a smaller t first.
+_SHORTER, _SHORTEST = 0.8, 1e-4  # factor by which a refused step is shortened, and length at which it is given up
 _RIDGE = 1e-9  # relative ridge, for directions on which neither objective nor inequalities depend
 _upper = cache(np.triu_indices)
 
@@ -66,11 +69,13 @@ class MatrixInequality:
         rows = _turned(_inverse_root(self.at(x))) @ self.slope
         return rows.reshape(-1, rows.shape[2])
 
-    def add_newton(self, x: Array, gradient: Array, hessian: Array) -> None:
-        """Add the gradient (n,) of -log det S and its Hessian (n, n) to the arguments."""
+    def along(self, W: Complex) -> Array:
+        """Return sum_k <W_k, slope_ka> for Hermitian matrices W (k, r, r), as (n,)."""
+        return packed(W).ravel() @ self.slope.reshape(-1, self.slope.shape[2])
+
+    def add_hessian(self, x: Array, hessian: Array) -> None:
+        """Add the Hessian (n, n) of -log det S to the argument."""
         rows = self.directions(x)
-        one = packed(np.eye(math.isqrt(self.constant.shape[1]), dtype=complex))
-        gradient -= np.tile(one, len(self.constant)) @ rows
         used = rows.any(axis=0)
         own = rows[:, used]
         hessian[... if used.all() else np.ix_(used, used)] += own.T @ own
@@ -85,7 +90,7 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The methods are those of MatrixInequality, but `add_newton` adds the upper triangle of the Hessian only.
+    The methods are those of MatrixInequality, but `add_hessian` adds the upper triangle of the Hessian only.
     The unknowns are the entries of the X_n, sorted by entry and then by n, followed by the x_a. At each frequency the
     second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
     S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)
@@ -131,10 +136,22 @@ class EntryInequality:
         """The matrices slope_a, (k, a, r, r)."""
         return _unpacked(np.swapaxes(self.slope, 1, 2))
 
-    def add_newton(self, x: Array, gradient: Array, hessian: Array) -> None:
+    def along(self, W: Complex) -> Array:
+        """Return sum_k <W_k, derivative of S_k> for Hermitian matrices W (k, r, r), as (unknowns,)."""
+        return self._along(W[:, None])[:, 0]
+
+    def _along(self, W: Complex) -> Array:
+        """Return `along` for each of the matrices W (k, a, r, r), as (unknowns, a)."""
         (k, n), r = self.functions.shape, self.left.shape[-1]
+        through = (self.right[:, None] @ W @ self.left[:, None]).swapaxes(2, 3).reshape(k, -1)
+        entry = self.functions.real.T @ through.real - self.functions.imag.T @ through.imag
+        entry = entry.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
+        return np.concatenate([entry, np.einsum("ksa,kbs->ab", self.slope, packed(W))])
+
+    def add_hessian(self, x: Array, hessian: Array) -> None:
+        n, r = self.functions.shape[1], self.left.shape[-1]
         L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
-        P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
+        P = inverse(self.at(x))
         row, column = (v.ravel() for v in np.indices((r, r)))
         one, two = _upper(r * r)
         (i, j), (g, h) = (row[one], column[one]), (row[two], column[two])
@@ -147,17 +164,8 @@ class EntryInequality:
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
         size = r * r * n
         hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] += between
-        # `turned` holds S^-1 and S^-1 slope_a S^-1, whose inner products with the derivatives of S follow.
-        P = P[:, None]
-        turned = np.concatenate([P, P @ self._own @ P], axis=1)
-        through = V[:, None] @ turned @ L[:, None]
-        entry = through[:, :, column, row].reshape(k, -1)
-        beside = self.functions.real.T @ entry.real - self.functions.imag.T @ entry.imag
-        beside = beside.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
-        own = np.einsum("ksa,kbs->ab", self.slope, packed(turned))
-        gradient -= np.concatenate([beside[:, 0], own[:, 0]])
-        hessian[:size, size:] += beside[:, 1:]
-        hessian[size:, size:] += own[:, 1:]
+        # The inner products of S^-1 slope_a S^-1 with the derivatives of S.
+        hessian[:, size:] += self._along(P[:, None] @ self._own @ P[:, None])
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
@@ -244,79 +252,132 @@ def solve_triangular(U: Array, b: Array | Complex, transposed: bool = False) -> 
     return x
 
 
-def _solve_positive(H: Array, b: Array) -> Array:
-    """Return H^-1 b for a symmetric H > 0, by its Cholesky factor. Raises LinAlgError if H is not positive definite."""
+def positive_factor(H: Array) -> Array:
+    """Return the Cholesky factor of a symmetric H > 0. Raises LinAlgError if H is not positive definite."""
     # The transpose is in LAPACK's order of entries, so that H is not transposed in memory.
     factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(H).T, lower=True, clean=False)
     if fault:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return factor
+
+
+def solve_positive(factor: Array, b: Array) -> Array:
+    """Return H^-1 b for a matrix H with this `positive_factor`."""
     return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=True)[0]
 
 
-def centre(program: Program, x: Array, t: float) -> Array:
-    """Return an approximate minimiser of t (|A x - b|^2 + c'x) - sum log det S; the start x is strictly feasible."""
-    cost = program.step_cost
-    for _ in range(budgets.CENTRING_STEPS):
-        spend(cost)
-        gradient = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
+# The central path ---------------------------------------------------------------------------------------------------
+
+
+def follow(
+    program: Program, x: Array, t: float, onward: Callable[[Array, float], float]
+) -> Iterator[tuple[Array, float]]:
+    """Yield points (x(t), t) of the central path, from a strictly feasible x and a first t.
+
+    `onward` returns the next t for a point of the path, or the same t if the path ends there. Where rounding prevents
+    a smaller Newton decrement, the last point counts as x(t).
+    """
+    aim, steps = t, 0
+    while True:
+        point = _Expanded(program, x, t)
+        stuck = steps == budgets.CENTRING_STEPS
+        centred = stuck or point.decrement <= _CENTRED
+        if stuck or (centred and t == aim):
+            yield x, t
+            aim, steps = onward(x, t), 0
+            if aim <= t:
+                return
+        before = x, t
+        if point.decrement > _FAR * program.degree and not stuck:
+            t *= 0.5 * math.sqrt(program.degree / point.decrement)
+        else:
+            x, t = point.moved(aim if centred else t)
+        steps = budgets.CENTRING_STEPS if (x is before[0] and t == before[1]) else steps + 1
+
+
+class _Expanded:
+    """The equation of the path at (x, t), grad |A x - b|^2 + c - (1/t) grad log det S = 0, and its solution nearby."""
+
+    def __init__(self, program: Program, x: Array, t: float) -> None:
+        spend(program.step_cost)
+        self._program, self._x, self._t = program, x, t
+        self._S = [block.at(x) for block in program.blocks]
+        self._P = [inverse(S) for S in self._S]
+        residual = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
+        self._residual = residual - sum(block.along(P) for block, P in zip(program.blocks, self._P, strict=True))
         hessian = 2 * t * program.square
         for block in program.blocks:
-            block.add_newton(x, gradient, hessian)
-        step = _solved(hessian, -gradient)
-        decrement = float(-gradient @ step)
-        if not decrement > _CENTRED:
-            break
-        x = x + _length(program, step, x, t) * step
-    return x
+            block.add_hessian(x, hessian)
+        self._scale, self._factor = _scaled_factor(hessian)
+        self.decrement = float(self._residual @ self._solved(self._residual))
+
+    def _solved(self, right: Array) -> Array:
+        return self._scale * solve_positive(self._factor, self._scale * right)
+
+    def moved(self, to: float) -> tuple[Array, float]:
+        """Return the point that a step towards x(to) reaches, and its t.
+
+        The curve x(s) satisfies the equation of the path with the residual (1 - s) times that at x(0), and with 1/t
+        linear in s, so that x(1) = x(to). `_terms` is its power series. The length s is the largest one at which the
+        barrier function decreases, or, towards a larger t, at which S remains well inside the cone.
+        """
+        change, s = self._t / to - 1, 1.0
+        terms, moves = self._terms(change)
+        value = self._barrier(self._x, self._S)
+        while s > _SHORTEST:
+            powers = s ** np.arange(_ORDER + 1)
+            x, S = powers @ terms, [np.tensordot(powers, move, axes=1) for move in moves]
+            if to == self._t:
+                allowed = self._barrier(x, S) < value - _DESCENT * s * self.decrement
+            else:
+                allowed = all(_definite(new - _KEPT * old) for new, old in zip(S, self._S, strict=True))
+            if allowed:
+                return x, to if s == 1 else self._t / (1 + s * change)
+            s *= _SHORTER
+        return self._x, to
+
+    def _terms(self, change: float) -> tuple[Array, list[Complex]]:
+        """Return the terms of x(s), (order + 1, n), and those of S(x(s)) in each block, (order + 1, k, r, r).
+
+        `change` is that of 1/t, relative to 1/t. With S = sum S_j s^j, the series P of S^-1 has the terms
+        P_j = -P_0 sum_i>0 S_i P_j-i. The part of P_j without x_j, and the change of 1/t times P_j-1, are the right side
+        of the equation for x_j, whose matrix is the Hessian.
+        """
+        blocks, right = self._program.blocks, -self._residual
+        terms, S, P = [self._x], [[S] for S in self._S], [[P] for P in self._P]
+        for j in range(1, _ORDER + 1):
+            for block, s, p in zip(blocks, S, P, strict=True):
+                p.append(-p[0] @ sum((s[i] @ p[j - i] for i in range(1, j)), np.zeros_like(p[0])))
+                right = right + block.along(p[j] + change * p[j - 1])
+            terms.append(self._solved(right))
+            right = np.zeros_like(right)
+            for block, s, p in zip(blocks, S, P, strict=True):
+                s.append(block.moved(terms[j]))
+                p[j] -= p[0] @ s[j] @ p[0]
+        return np.array(terms), [np.array(s) for s in S]
+
+    def _barrier(self, x: Array, S: Sequence[Complex]) -> float:
+        """Return t (|A x - b|^2 + c'x) - sum log det S, infinite if S is not positive definite."""
+        try:
+            factors = [np.linalg.cholesky(part) for part in S]
+        except np.linalg.LinAlgError:
+            return np.inf
+        logarithms = sum(np.log(np.diagonal(F, axis1=1, axis2=2).real).sum() for F in factors)
+        return self._t * self._program.value(x) - 2 * float(logarithms)
 
 
-def towards(start: Array, x: Array, program: Program) -> Array:
-    """Return x if it is feasible, else the point at 0.9 of the way from the feasible `start` to the boundary."""
-    if program.feasible(x):
-        return x
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if program.feasible(start + middle * (x - start)) else (low, middle)
-    return start + 0.9 * low * (x - start)
-
-
-def _solved(hessian: Array, right: Array) -> Array:
-    """Return hessian^-1 right, with a ridge that grows until the Hessian, which is scaled in place, has a factor."""
+def _scaled_factor(hessian: Array) -> tuple[Array, Array]:
+    """Return (scale, factor of the Hessian times the scale from both sides); a ridge grows until there is a factor."""
     scale = 1 / np.sqrt(np.diag(hessian))
     hessian *= scale[:, None]
     hessian *= scale
     diagonal, ridge = hessian.diagonal().copy(), 0.0
     while True:
         try:
-            return scale * _solve_positive(hessian, scale * right)
+            return scale, positive_factor(hessian)
         except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
             np.fill_diagonal(hessian, diagonal + ridge)
-
-
-def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """Return the step length that minimises the barrier function and leaves at least _KEPT of every eigenvalue of S."""
-    along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
-    residual, slope = program.A @ x - program.b, program.A @ step
-    linear, square = 2 * t * residual @ slope + t * program.c @ step, 2 * t * slope @ slope
-
-    def rises(s: float) -> bool:
-        return linear + square * s > (along / (1 + s * along)).sum()
-
-    low, high = 0.0, (1 - _KEPT) / -along.min() if along.min() < 0 else _LONGEST
-    if not rises(high):
-        return high
-    while high - low > 0.01 * high:
-        middle = (low + high) / 2
-        low, high = (low, middle) if rises(middle) else (middle, high)
-    return (low + high) / 2
-
-
-def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Array) -> Array:
-    """Return the eigenvalues of S^-1/2 dS S^-1/2 at every frequency, where dS is the change of S by the step."""
-    inverse = _inverse_root(block.at(x))
-    return np.linalg.eigvalsh(inverse @ block.moved(step) @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 
 
 def _turned(W: Complex) -> Array:
@@ -347,6 +408,11 @@ def _unpacked(v: Array) -> Complex:
     H = H + np.conj(np.swapaxes(H, -2, -1))
     H[..., np.arange(r), np.arange(r)] = v[..., :r]
     return H
+
+
+def inverse(S: Complex) -> Complex:
+    """Return the inverses of Hermitian matrices (k, r, r)."""
+    return hermitian(np.linalg.inv(S).astype(np.complex128, copy=False))
 
 
 def _inverse_root(S: Complex) -> Complex:

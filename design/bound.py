@@ -34,7 +34,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.controller.passivity import sizes_around
 from haptic_loop.design import budgets
-from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, solve_triangular, towards
+from haptic_loop.design.barrier import EntryInequality, Program, follow, packed, solve_triangular
 from haptic_loop.design.conditions import even_level
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.files import off_table
@@ -294,20 +294,23 @@ class _Dual:
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
         A, b, c = self.objective()
-        nothing, sampled, remains, x, t = float(b @ b), 0.0, 0.0, self.start, 0.0
+        nothing, sampled, remains = float(b @ b), 0.0, 0.0
+        path = list[tuple[Array, float]]()
         for _ in range(budgets.BOUND_SWEEPS):
             program = Program(A, b, c, (self.block(imposed),))
-            t, path = max(t, _FIRST * program.degree / nothing), [towards(self.start, x, program)]
-            while True:
-                path.append(centre(program, path[-1], t))
-                value = nothing - program.value(path[-1])
-                last = program.degree / (_GAP * max(value, _LEAST))
-                if t >= last:
-                    break
-                t = min(_STEEPER * t, last)
-            rooms = [np.linalg.eigvalsh(looked.at(x))[:, 0] for x in path]
-            inside = [_between(inner, room, path[-1], rooms[-1]) for inner, room in zip(path, rooms, strict=True)]
-            inside.append(_between(self.start, np.ones(swept.size), path[-1], rooms[-1]))
+            path = path or [(self.start, _FIRST * program.degree / nothing)]
+
+            def onward(x: Array, t: float, program: Program = program) -> float:
+                last = program.degree / (_GAP * max(nothing - program.value(x), _LEAST))
+                return min(_STEEPER * t, last)
+
+            first = len(path)
+            path += list(follow(program, *path[-1], onward))
+            points = [x for x, _ in path[first:]]
+            value = nothing - program.value(points[-1])
+            rooms = [np.linalg.eigvalsh(looked.at(x))[:, 0] for x in points]
+            inside = [_between(inner, room, points[-1], rooms[-1]) for inner, room in zip(points, rooms, strict=True)]
+            inside.append(_between(self.start, np.ones(swept.size), points[-1], rooms[-1]))
             some = [(nothing - program.value(x), x) for x in inside if x is not None]
             missing = _worst(-rooms[-1], swept)
             if some:
@@ -318,7 +321,9 @@ class _Dual:
             if (remains if self.exact else sampled) >= (1 - _LARGEST_CHARGE) * value:
                 break
             imposed = np.union1d(imposed, missing)
-            x, t = path[-2], t / _STEEPER
+            added = Program(A, b, c, (self.block(missing),))
+            while len(path) > 1 and not added.feasible(path[-1][0]):
+                path.pop()
         return sampled, remains
 
 

@@ -591,7 +591,8 @@ class _Search:
         rho (Re M/z - beta/4), where the multiplier M satisfies Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
-        while problem.room(start := problem.start(kappa)) <= 0:
+        grids = [problem.grid(*pair) for pair in problem.pairs]
+        while problem.room(start := problem.start(kappa), grids) <= 0:
             kappa /= 2
         return start
 

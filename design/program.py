@@ -8,7 +8,7 @@ violates a constraint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Literal
@@ -27,11 +27,10 @@ from haptic_loop.design.barrier import (
     EntryInequality,
     MatrixInequality,
     Program,
-    centre,
+    follow,
     joined,
     packed,
     solve_triangular,
-    towards,
     triangular_factor,
 )
 from haptic_loop.design.conditions import even_damping, this_environment_demand
@@ -365,6 +364,10 @@ class Problem:
         return list(pairwise(accumulate(counts, initial=self.span.unknowns)))
 
     @property
+    def pairs(self) -> _Pairs:
+        return [(case, constraint) for case in self.cases for constraint in case.constraints]
+
+    @property
     def unknowns(self) -> int:
         return self.span.unknowns + sum(len(c.start) for case in self.cases for c in case.constraints)
 
@@ -465,17 +468,10 @@ class Problem:
         slope[0, at] = 1
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
-    def _dense(
-        self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], start: Array, x: Array
-    ) -> _Posed:
-        """Return (program in well-conditioned coordinates y, feasible start y, map from y to x).
-
-        The start is x. If x is infeasible, the start is a feasible point between `start` and x.
-        """
+    def _dense(self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], x: Array) -> _Posed:
+        """Return (program in well-conditioned coordinates y, feasible y of x, map from y to x)."""
         parts = [self.block(*one, own, w) for one, own, w in zip(pairs, self.own, imposed, strict=True)]
-        program = Program(A, b, c, joined([*parts, self._positive(0)]))
-        x = towards(start, x, program)
-        program, U = program.conditioned(x)
+        program, U = Program(A, b, c, joined([*parts, self._positive(0)])).conditioned(x)
         return program, U @ x, lambda y: solve_triangular(U, y)
 
     @property
@@ -484,10 +480,8 @@ class Problem:
         full = self.span.used.all() and self.span.used.shape[1] == self.span.used.shape[2] > 2
         return bool(full) and all(constraint.through for case in self.cases for constraint in case.constraints)
 
-    def _by_entries(
-        self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], start: Array, x: Array
-    ) -> _Posed:
-        """Return (program, feasible start y, map from y to x), with y ordered by entries of R, then g.
+    def _by_entries(self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], x: Array) -> _Posed:
+        """Return (program, feasible y of x, map from y to x), with y ordered by entries of R, then g.
 
         The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
         """
@@ -517,7 +511,7 @@ class Problem:
             blocks.append(EntryInequality(still, own, left, delayed.G[0] * constraint.unit, g[..., None]))
         by_entry = turned(A[:, 1:].T.reshape(n, -1)).reshape(n, m * m, -1).transpose(2, 1, 0).reshape(len(A), -1)
         program = Program(np.column_stack([by_entry, A[:, 0]]), b, there(c), tuple(blocks))
-        return program, towards(there(start), there(x), program), back
+        return program, there(x), back
 
     def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """Return the least eigenvalue of a constraint at x for each frequency w, (k,)."""
@@ -540,16 +534,12 @@ class Problem:
         w = np.unique(np.concatenate([even, rising, around]))
         return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]
 
-    def room(self, x: Array, dense: bool = False) -> float:
-        """Return the least eigenvalue of all constraints at x, on the initial grids or on dense sweeps."""
-        rooms, own = [], iter(self.own)
-        for case in self.cases:
-            for constraint in case.constraints:
-                w = self._sweep(case, constraint) if dense else self.grid(case, constraint)
-                rooms.append(self.least(case, constraint, next(own), x, w).min())
-        return float(min(rooms))
+    def room(self, x: Array, grids: Iterable[Array]) -> float:
+        """Return the least eigenvalue of all constraints at x, each on its own grid of frequencies."""
+        parts = zip(self.pairs, self.own, grids, strict=True)
+        return min(float(self.least(*pair, own, x, w).min(initial=np.inf)) for pair, own, w in parts)
 
-    def _sweep(self, case: Case, constraint: _Constraint) -> Array:
+    def sweep(self, case: Case, constraint: _Constraint) -> Array:
         """Return a dense grid that resolves every pole, over the band of a constraint [rad/sample]."""
         return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
@@ -559,7 +549,7 @@ class Problem:
         for case in self.cases:
             for constraint in case.constraints:
                 mine = next(own)
-                w = self._sweep(case, constraint)
+                w = self.sweep(case, constraint)
                 fails = lambda w, case=case, constraint=constraint, mine=mine: -self.least(case, constraint, mine, x, w)  # noqa: E731
                 missing.append(peaks(fails, w, above=0.0))
                 worst = max(worst, float(fails(missing[-1]).max(initial=0.0)))
@@ -570,35 +560,35 @@ class Problem:
 
         If PROGRAM_SWEEPS rounds are not enough, violations above _FORGIVEN are left to `_kept` or to the caller.
         """
-        pairs = [(case, constraint) for case in self.cases for constraint in case.constraints]
-        imposed = [self.grid(case, constraint) for case, constraint in pairs]
+        pairs, imposed = self.pairs, [self.grid(*pair) for pair in self.pairs]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
         R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
         A, b = R[:, :-1], R[:, -1]
-        x, t, gaps = start, None, list(_GAPS)
-        inner = start
         nothing = float(b @ b) + float(c.any())  # objective of zero force, whose relative mismatch is 1
         # With one constraint per environment, the caller scales the forces down.
         demanding = any(len(case.constraints) > 1 for case in self.cases)
-        lower = _STEEPER**4 if demanding else _STEEPER
+        path, gaps, inner, x = list[tuple[Array, float]](), list(_GAPS), start, start
         for _ in range(budgets.PROGRAM_SWEEPS):
-            program, y, back = posed(A, b, c, pairs, imposed, start, x)
-            t = program.degree / max(program.value(y), 1e-12) if t is None else t / lower
-            y = centre(program, y, t)
-            inner = back(y)
-            while True:
+            program, y, back = posed(A, b, c, pairs, imposed, x)
+            path = path or [(start, program.degree / max(program.value(y), 1e-12))]
+
+            def onward(y: Array, t: float, program: Program = program, gap: float = gaps[0]) -> float:
                 value = program.value(y)
-                if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
-                    break
-                t *= _STEEPER
-                y = centre(program, y, t)
-            x = back(y)
+                return t if program.degree / t <= gap * max(min(value, nothing - value), 1e-9) else _STEEPER * t
+
+            first = len(path)
+            path += [(back(y), t) for y, t in follow(program, y, path[-1][1], onward)]
+            (inner, _), (x, last) = path[first], path[-1]
             more, worst = self.missed(x)
             if worst < _FORGIVEN and len(gaps) == 1:
                 break
             gaps = gaps[-1:]
             imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]
+            most = 1.001 * (last / _STEEPER**4 if demanding else last)
+            while len(path) > 1 and (path[-1][1] > most or self.room(path[-1][0], more) <= 0):
+                path.pop()
+            x = path[-1][0]
         return self._kept(inner, start, x) if demanding else x
 
     def _kept(self, inner: Array, start: Array, x: Array) -> Array:
@@ -608,7 +598,7 @@ class Problem:
         """
         _, worst = self.missed(x)
         for base in (inner, start):
-            if (room := self.room(base, dense=True)) > 0:
+            if (room := self.room(base, [self.sweep(*pair) for pair in self.pairs])) > 0:
                 return base + max(0.0, 1 - 1.01 * worst / (worst + room)) * (x - base)
         return start
 

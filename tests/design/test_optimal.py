@@ -21,7 +21,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
 from haptic_loop.design import barrier, program
-from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre
+from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, follow, inverse
 from haptic_loop.design.bound import BoundBeside, _causal, bound
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.conditions import ratio_in
@@ -545,9 +545,10 @@ def test_matrix_routines_are_those_of_scipy(n):
                 x = scipy.linalg.solve_triangular(stored, b, trans=int(transposed))
                 assert (barrier.solve_triangular(stored, b, transposed) == x).all()
     H, b = rows.T @ rows, rng.standard_normal(n)
-    assert (barrier._solve_positive(H, b) == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, lower=True), b)).all()
+    x = barrier.solve_positive(barrier.positive_factor(H), b)
+    assert (x == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, lower=True), b)).all()
     with pytest.raises(np.linalg.LinAlgError):
-        barrier._solve_positive(-H, b)
+        barrier.positive_factor(-H)
 
 
 def test_the_barrier_reaches_a_cone_solvers_optimum():
@@ -557,9 +558,7 @@ def test_the_barrier_reaches_a_cone_solvers_optimum():
     slope = hermitian(rng.normal(size=(k, n, r, r)) + 1j * rng.normal(size=(k, n, r, r)))
     block = MatrixInequality.of(np.tile(np.eye(r, dtype=complex), (k, 1, 1)), slope)
     program, U = Program(A, b, c, (block,)).conditioned(np.zeros(n))
-    y = np.zeros(n)
-    for t in np.geomspace(1, 1e7, 22):
-        y = centre(program, y, t)
+    (*_, (y, _)) = follow(program, np.zeros(n), 1.0, lambda y, t: min(2 * t, 1e7))
     x = cp.Variable(n)
     held = [np.eye(r) + sum(x[a] * slope[i, a] for a in range(n)) >> 0 for i in range(k)]
     value = cp.Problem(cp.Minimize(cp.sum_squares(A @ x - b) + c @ x), held).solve(solver=cp.CLARABEL)
@@ -580,22 +579,34 @@ def test_entrywise_and_dense_inequalities_are_equal():
     split = EntryInequality(dense.constant, functions, left, right, dense.slope[:, :, -1:])
     x = np.append(rng.normal(size=2 * r * r), 100.0)
     np.testing.assert_allclose(split.at(x), dense.at(x), rtol=0, atol=1e-12)
-    derivatives = [(np.ones(x.size), np.ones((x.size, x.size))) for _ in (split, dense)]
-    for block, (gradient, hessian) in zip((split, dense), derivatives, strict=True):
-        block.add_newton(x, gradient, hessian)
-    for one, other in zip(*derivatives, strict=True):
-        np.testing.assert_allclose(np.triu(one), np.triu(other), rtol=0, atol=1e-12)
+    W = hermitian(rng.normal(size=(k, r, r)) + 1j * rng.normal(size=(k, r, r)))
+    np.testing.assert_allclose(split.along(W), dense.along(W), rtol=0, atol=1e-12)
+    hessians = [np.ones((x.size, x.size)) for _ in (split, dense)]
+    for block, hessian in zip((split, dense), hessians, strict=True):
+        block.add_hessian(x, hessian)
+    np.testing.assert_allclose(*map(np.triu, hessians), rtol=0, atol=1e-12)
 
 
 def test_a_bound_on_one_unknown_adds_one_derivative():
     """-log(x_2) has the derivatives -1/x_2 and 1/x_2^2; those of the other unknowns are 0."""
     slope = np.eye(3, dtype=complex)[1].reshape(1, 3, 1, 1)
-    gradient, hessian = np.zeros(3), np.zeros((3, 3))
-    MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope).add_newton(
-        np.array([3.0, 4.0, 5.0]), gradient, hessian
-    )
-    np.testing.assert_allclose(gradient, [0, -1 / 4, 0], rtol=1e-15, atol=0)
+    block = MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
+    x, hessian = np.array([3.0, 4.0, 5.0]), np.zeros((3, 3))
+    block.add_hessian(x, hessian)
+    np.testing.assert_allclose(-block.along(inverse(block.at(x))), [0, -1 / 4, 0], rtol=1e-15, atol=0)
     np.testing.assert_allclose(hessian, np.diag([0, 1 / 16, 0]), rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize("start", [0.5, 1e-6, 1 - 1e-9])
+def test_the_central_path_is_the_closed_form(start):
+    """The minimiser of t x - log x - log(1 - x) is the lesser root of t x^2 - (t + 2) x + 1, also from a far start."""
+    slope = np.array([1, -1], dtype=complex).reshape(2, 1, 1, 1)
+    block = MatrixInequality.of(np.array([0, 1], dtype=complex).reshape(2, 1, 1), slope)
+    line = Program(np.zeros((1, 1)), np.zeros(1), np.ones(1), (block,))
+    path = list(follow(line, np.array([start]), 1e3, lambda x, t: min(3 * t, 1e9)))
+    assert (path[0][1], path[-1][1]) == (1e3, 1e9)
+    for x, t in path[1:]:
+        assert x[0] == pytest.approx(2 / (t + 2 + np.hypot(t, 2)), rel=0.02)
 
 
 @pytest.mark.validate
