@@ -46,8 +46,8 @@ def main(argv: list[str]) -> int:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
     chosen = chosen_by(args, scenario)
-    lag = assessed(scenario, args.case, chosen, limiter=args.limiter).force_limits.rho
-    coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
+    rho = assessed(scenario, args.case, chosen, limiter=args.limiter).force_limits.rho
+    coupled, uncoupled = assemble(scenario, chosen.coupling, rho), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
     if scenario.samples * default > _MOST_STEPS:
         longest = _MOST_STEPS // default * scenario.T

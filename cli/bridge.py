@@ -31,7 +31,7 @@ from haptic_loop.sim.couplings import NAMES, encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
-_LONGEST = 3600.0  # [s] largest --duration, the time at full gain of an arming, because the trace is kept in memory
+_LONGEST = 3600.0  # [s] largest --duration (time at full gain after arming), because the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
@@ -67,12 +67,12 @@ def main(argv: list[str]) -> int:
         energies = {"start": start, "energy_budget": budget}
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, behind=behind, **energies)
         steps = session.units.encoder_step
-        programs = [_counted(program, steps) for program in programs]
+        programs = [_with_encoder_steps(program, steps) for program in programs]
         render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
             note = (
-                "· delta is a full matrix, but INFO has one number per axis: "
+                "· delta is a full matrix, but the device's INFO has one number per axis: "
                 "the certificate uses the smaller diagonal matrix"
             )
             render.console(args).print(f"{note} {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
@@ -93,8 +93,8 @@ def main(argv: list[str]) -> int:
     return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 
-def _counted(program: CertifiedCoupling, steps: Sequence[float]) -> CertifiedCoupling:
-    """Assess the coupling for the encoder steps (m,) [m] that the device reports."""
+def _with_encoder_steps(program: CertifiedCoupling, steps: Sequence[float]) -> CertifiedCoupling:
+    """Return the program, assessed for the encoder steps (m,) [m] that the device reports."""
     encoder = encoder_steps(program.scenario, program.case, program.assessment, steps)
     return replace(program, assessment=program.assessment.with_encoder(encoder))
 
@@ -119,8 +119,8 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
     counted = ("--latch arrival", args.latch == "arrival"), ("a world", is_world(scenario))
     for feature, present in (*counted, ("--energy-budget", args.energy_budget)):
         if several_boards and present:
-            by_one = f"{feature} counts forces by one clock, but each board has its own clock"
-            raise InputError(f"--port is {args.port}: {by_one}")
+            several = f"{feature} needs one clock for all devices, but each board has its own clock"
+            raise InputError(f"--port is {args.port}: {several}")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,7 +19,7 @@ from haptic_loop.design.certificate import (
     Verdict,
     condition_of,
     covered,
-    lag,
+    limiter_rho,
     named,
     on_file,
     prove,
@@ -162,7 +162,7 @@ def _checked(
         claim and claim.required,
         loop.delta,
         claim and claim.margin,
-        "proved, also while forces are limited" if proved and lag(loop, claim) is not None else None,
+        "proved, also while forces are limited" if proved and limiter_rho(loop, claim) is not None else None,
         seconds,
         switching,
     )

@@ -1,8 +1,8 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
-Without --coupling, the table has one row for each coupling of sim.comparison that suits the loop; it states why a
-design failed. If the loop has neither walls nor friction, each coupling is also run with the scenario's hands, and
-couplings.png shows the forces, except for the paper's gains. With --coupling, the named couplings are drawn over
+Without --coupling, the table has one row for each coupling of sim.comparison that suits the loop. The row of a failed
+design says why it failed. In loops without walls and friction each coupling also runs with the scenario's hands;
+couplings.png shows the forces, but not those of the paper's gains. With --coupling, the named couplings are drawn over
 frequency.
 """
 

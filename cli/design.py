@@ -94,7 +94,7 @@ def _parser() -> options.Parser:
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order (Remark 5)")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    _add_optimal_options(parser, "optimal (--band: spring-damper, too): the force filter of least transparency error")
+    _add_optimal_options(parser, "optimal: the force filter of least transparency error (--band: spring-damper, too)")
     parser.add_output(
         "FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>][-<condition>].json)"
     )
@@ -168,7 +168,7 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
             able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
             raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
     with render.progress("designing softer and softer couplings"):
-        design, decay = _that_decays(scenario, loop, make, args.decay)
+        design, decay = _decaying_design(scenario, loop, make, args.decay)
         return proved(loop, design), decay
 
 
@@ -176,7 +176,7 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
 _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 
 
-def _that_decays(
+def _decaying_design(
     scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
     """Design softer couplings, for less and less damping, until no mode's damping ratio is below `ratio`.

@@ -190,16 +190,16 @@ def _sitting(
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
 
     if args.port and number > 1:
-        told = "take every handle 5 mm or more away and let go"
-        told += ": the sitting begins 5 s later" if args.arm else "; then press key a"
+        task = "take every handle 5 mm or more away and let go"
+        task += ": the sitting begins 5 s later" if args.arm else "; then press key a"
         if clamped is not None:
-            told = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"
+            task = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission
-        render.console(args).print(f"sitting {number} of {count}: {told}")
-    alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
+        render.console(args).print(f"sitting {number} of {count}: {task}")
+    emulated = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
     # `hold_session` counts time at full gain, which the gain reaches in the first 0.3 s, with zero force.
     seconds = played(1).seconds - 0.2
-    live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
+    live = hold_session(args, session, plan, seconds, out, emulated, r * args.coulomb)
     if number == 1:
         render.remove_earlier(out, "devices.toml", *(each.name for each in out.glob("trace-[0-9]*.npz")))
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
@@ -218,12 +218,12 @@ def _sitting(
 
 
 def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
-    session, told = sittings[-1].session, [sitting.axes for sitting in sittings if sitting.axes]
+    session, estimates = sittings[-1].session, [sitting.axes for sitting in sittings if sitting.axes]
     left_out = [f"sitting {k}: {sitting.reason}" for k, sitting in enumerate(sittings, start=1) if sitting.reason]
-    axes, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
+    axes, reason, warnings = (estimates[0] if estimates else []), "; ".join(left_out), left_out
     try:
-        if told:
-            axes, hands = settled(told)
+        if estimates:
+            axes, hands = settled(estimates)
             reason, warnings = "", left_out + hands
     except ValueError as error:
         reason, warnings = str(error), left_out

@@ -183,7 +183,7 @@ class Parser(argparse.ArgumentParser):
     def add_condition(
         self, what: str = "condition to certify (default: that of the coupling)", to: _Group | None = None
     ) -> None:
-        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own"
+        help_ = f"{what}; one of {', '.join(CONDITIONS)} or FILE.py:NAME of your own"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
@@ -203,7 +203,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
-        what = "scale forces so that no passive hand receives more than W0 [J]; the budget never exceeds CAP [J]"
+        what = "scale forces: no passive hand gets over W0 [J] more than devices dissipate; CAP [J] limits the budget"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:

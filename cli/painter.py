@@ -61,7 +61,7 @@ def _started() -> subprocess.Popen[bytes] | None:
 
 
 class Painter:
-    """Draws one picture, in a second process if `wanted` and if this process has not loaded matplotlib."""
+    """Draws one picture in the second process of `begin`, or in a new one if `wanted`; else in this process."""
 
     def __init__(self, wanted: bool = True) -> None:
         global _begun

@@ -149,9 +149,9 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
     net = EnergyNet(*args.energy_budget, guarantee=claim(assessment)) if args.energy_budget else None
     settings = EngineSettings(args.engine, args.integrator, args.substeps, args.error)
-    coupling, lag = assessment.coupling, assessment.force_limits.rho
+    coupling, rho = assessment.coupling, assessment.force_limits.rho
     with render.progress("simulating") as move:
-        return run_scenario(scenario, coupling, lag, settings, args.seed, net, move)
+        return run_scenario(scenario, coupling, rho, settings, args.seed, net, move)
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
@@ -268,7 +268,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield (
         "force error",
-        f"{apart}, before clipping (after it with a limiter, an energy budget or switching delays)"
+        f"{apart} (forces before clipping; with a limiter, a budget or switching delays: sent forces)"
         if apart
         else f"- ({report.ideal_force.reason})",
     )

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from haptic_loop.controller.units import in_unit
-from haptic_loop.design.files import nobody_reads, printable
+from haptic_loop.design.files import discard_output, printable
 
 _CUT = "…"  # rich's mark for a cut word
 _WIDEST = 400  # [characters] largest width of a table
@@ -54,7 +54,7 @@ class Screen(Console):
     def on_broken_pipe(self) -> None:
         """Continue without output after its reader has left (`| head -1`). rich would change the exit code to 1."""
         self.quiet = True
-        nobody_reads()
+        discard_output()
 
     def _needed(self, table: Table) -> int:
         least = 4 * len(table.columns) + 1  # frames, padding and one character for each column

@@ -153,8 +153,8 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
         )
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
-    lag, every = assessment.force_limits.rho, args.traces == "all"
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=lag, all_traces=every)
+    rho, every = assessment.force_limits.rho, args.traces == "all"
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=rho, all_traces=every)
 
 
 def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:

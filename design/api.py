@@ -16,7 +16,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.arguments import known, of_kind, one_of, shown
 from haptic_loop.design.assessment import Assessment, check_ranges
-from haptic_loop.design.certificate import judged, lag, named, prove, requirements_of
+from haptic_loop.design.certificate import judged, limiter_rho, named, prove, requirements_of
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
@@ -248,7 +248,7 @@ def store(
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, limiter)
     save(Stored.of(loop, design.coupling, certificate), path)
-    limited = certificate is not None and lag(loop, certificate) is not None
+    limited = certificate is not None and limiter_rho(loop, certificate) is not None
     return Filed(path, certificate and certificate.proof, reason, switching, limited)
 
 

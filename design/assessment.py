@@ -28,7 +28,7 @@ from haptic_loop.design.certificate import (
     condition_of,
     is_ours,
     judged,
-    lag,
+    limiter_rho,
     named,
     on_file,
     prove,
@@ -322,10 +322,10 @@ def _covered_limits(
     multipliers are searched for a limiter of the same beta (LimitedForces). Without a `proof`, this-environment first
     tries the multipliers `c`. `known` is a certificate that has been verified.
     """
-    covering = [each for each in requirements.values() if each.certified and each.lag is not None]
+    covering = [each for each in requirements.values() if each.certified and each.limiter_rho is not None]
     for each in sorted(covering, key=lambda each: each.proof != "rational"):
         swept = "" if each.proof == "rational" else "by a refined sweep, without an exact proof: "
-        return ForceLimits(each.lag, f"{swept}{each.condition} covers limited forces", proof=each.proof)
+        return ForceLimits(each.limiter_rho, f"{swept}{each.condition} covers limited forces", proof=each.proof)
     extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
     if not extended:
         return ForceLimits(None, "no certified condition that extends to limited forces")
@@ -354,7 +354,8 @@ def _by_its_own_block(
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
             rows, bounded = _rows(condition, loop, requirement), isinstance(condition, LimitedKnownDevice)
-            covered = ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, rows, proof, proof=requirement.proof)
+            rho = limiter_rho(loop, proof)
+            covered = ForceLimits(rho, _OWN_PROOF, requirement, rows, proof, proof=requirement.proof)
             return replace(covered, bounded=bounded)
         except NotProved:  # The proof does not hold in this loop, or would take long.
             pass
@@ -593,7 +594,7 @@ class Assessment:
 
     @property
     def held_torques(self) -> str | None:
-        """The remark that conditions ignore the change of pose while torques are held; None for devices of one axis."""
+        """The remark that proofs neglect the change of pose while motors hold torques; None for devices of one axis."""
         return held_torques(self.loop)
 
     def without_guarantee(self, reason: str) -> Assessment:

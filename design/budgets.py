@@ -28,9 +28,9 @@ RANGES = 60.0
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
-#: Largest number of unknowns of a basis with filters between all channels, for this-environment alone: ten seconds.
+#: Largest number of unknowns of a basis with filters between all channels, for this-environment alone (ten seconds).
 BASIS_UNKNOWNS = 1600
-#: In all other cases, the largest product of the numbers of unknowns and channels: also ten seconds.
+#: In all other cases, the largest product of the numbers of unknowns and channels (also ten seconds).
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried; ranges have no limit.
 UNPROVED_BASES = 2

@@ -254,14 +254,14 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     )
 
 
-def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
+def limiter_rho(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
     """Return rho (m,) [N/m] of the limiter that the certificate covers, or None."""
     if certificate is None:
         return None
     if certificate.limiter:
         return loop.per_channel(certificate.multipliers["rho"])
     known = _NAMED.get(certificate.condition)
-    return known.lag(loop) if known else None
+    return known.limiter_rho(loop) if known else None
 
 
 def covered(loop: Loop, claim: Certificate) -> Iterator[str]:

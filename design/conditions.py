@@ -267,7 +267,7 @@ class Condition(ABC):
             )
         except SingularLoop as error:
             requirement = refusal(self.name, loop.delta, str(error))
-        return replace(requirement, guarantee=self.words(loop), lag=self.lag(loop))
+        return replace(requirement, guarantee=self.words(loop), limiter_rho=self.limiter_rho(loop))
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         """Return required over available damping; `thin` allows a sweep over every thin-th frequency only."""
@@ -324,7 +324,7 @@ class Condition(ABC):
         """Return the numbers that a run must use and that a certificate stores with the multipliers, such as rho."""
         return {}
 
-    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+    def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
         """Return rho (m,) [N/m] of the limiter that this condition covers without further proof, or None."""
         return None
 

@@ -517,7 +517,7 @@ class LimitedForces(ThisEnvironment):
     def base(self) -> str:
         return ThisEnvironment.name if self.name == LimitedForces.name else self.name
 
-    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+    def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
         return loop.per_channel(self.rho(loop))
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
@@ -812,7 +812,7 @@ class _AnyEnvironment(Multiplied):
     def members(self, loop: Loop) -> tuple[Member, ...]:
         return ()
 
-    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+    def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
         return None if any(loop.psi) or self._extended else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Environments:

@@ -435,7 +435,8 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (a change of coordinates, P in the new ones). `white` is as in `find_storage`. Raises LinAlgError."""
+    """Return (a change of coordinates, P in the new ones). If `white`, white noise at the inputs moves the new states
+    equally and independently; else the coordinates stay. Raises LinAlgError."""
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
         out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2

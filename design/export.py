@@ -20,7 +20,7 @@ from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.ranges import where_proved
-from haptic_loop.design.certificate import Verdict, covered, lag
+from haptic_loop.design.certificate import Verdict, covered, limiter_rho
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.result import RANGES, listed
 
@@ -138,7 +138,7 @@ def process_block(
 def _limited_block(
     stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice], delays: str
 ) -> ExportedBlock:
-    rho = lag(stored.loop, stored.certificate)
+    rho = limiter_rho(stored.loop, stored.certificate)
     if rho is None:
         raise ValueError("the certificate covers no limited forces: design the coupling anew, or omit --force-limit")
     limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho, balls=balls)
@@ -340,17 +340,17 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
     m, real = len(q), type(q[0])
     zero, one, two = real(0), real(1), real(2)
     residual, rounding = real(_RESIDUAL), real(_ball_rounding(real is np.float32))
-    u, g, v, r, x, asked, back, normal = ([zero] * m for _ in range(8))
+    u, g, v, r, x, rhs, back, normal = ([zero] * m for _ in range(8))
     e, f, share, a = [zero] * m, [zero] * m, [one] * m, [[zero] * (m + 1) for _ in range(m)]
 
     begin = 0
     for end in ends:
         rows, solved, tried, best = range(begin, end), False, False, zero
         for i in rows:
-            asked[i] = q[at[i]]
+            rhs[i] = q[at[i]]
             for j in range(begin):
-                asked[i] -= M[i][j] * v[j]
-            u[i] = asked[i]
+                rhs[i] -= M[i][j] * v[j]
+            u[i] = rhs[i]
         for _ in range(_MOST_STEPS):
             size, worst = zero, zero
             for i in rows:  # g is u, shortened to the limits, and v is (u - g)/tau.
@@ -364,8 +364,8 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
                     g[i] = share[i] * u[i]
                 v[i] = (u[i] - g[i]) / tau[i]
             for i in rows:  # residual r
-                terms = abs(g[i]) + abs(asked[i])
-                r[i] = g[i] - asked[i]
+                terms = abs(g[i]) + abs(rhs[i])
+                r[i] = g[i] - rhs[i]
                 for j in rows:
                     r[i] += M[i][j] * v[j]
                     terms += abs(M[i][j] * v[j])
@@ -383,7 +383,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             if tried or best == zero:
                 best = worst
             for i in rows:  # `back` is the step of Douglas and Rachford, and `a` holds the equations of Newton's step.
-                x[i] = asked[i]
+                x[i] = rhs[i]
                 for j in rows:
                     x[i] += M[i][j] * ((two * g[j] - u[j]) / tau[j])
             for i in rows:
@@ -408,7 +408,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             for i in rows:
                 for j in rows:
                     a[i][j] = M[i][j]
-                a[i][end] = asked[i]
+                a[i][end] = rhs[i]
                 g[i] = zero
             _eliminated(a, begin, end, v)
         begin = end
@@ -649,17 +649,17 @@ static void ${name}_eliminate(${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1],
 static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
 {
     ${real} u[${NAME}_CHANNELS], g[${NAME}_CHANNELS], v[${NAME}_CHANNELS], r[${NAME}_CHANNELS], x[${NAME}_CHANNELS];
-    ${real} asked[${NAME}_CHANNELS], back[${NAME}_CHANNELS], normal[${NAME}_CHANNELS], share[${NAME}_CHANNELS];
+    ${real} rhs[${NAME}_CHANNELS], back[${NAME}_CHANNELS], normal[${NAME}_CHANNELS], share[${NAME}_CHANNELS];
     ${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1];
-    int block, turn, i, j, k, begin = 0, found = 1;
+    int block, turn, i, j, k, begin = 0, converged = 1;
     for (block = 0; block < $blocks; block++) {
         ${real} best = 0.0${f};
         int end = ${name}_END[block], solved = 0, tried = 0;
         for (i = begin; i < end; i++) {
-            asked[i] = q[${name}_AT[i]];
+            rhs[i] = q[${name}_AT[i]];
             for (j = 0; j < begin; j++)
-                asked[i] -= ${name}_M[i][j] * v[j];
-            u[i] = asked[i];
+                rhs[i] -= ${name}_M[i][j] * v[j];
+            u[i] = rhs[i];
         }
         for (turn = 0; turn < $turns; turn++) {
             ${real} size = 0.0${f}, worst = 0.0${f};
@@ -679,8 +679,8 @@ static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CH
                 v[i] = (u[i] - g[i]) / ${name}_TAU[0][i];
             }
             for (i = begin; i < end; i++) {
-                ${real} terms = ${name}_size(g[i]) + ${name}_size(asked[i]);
-                r[i] = g[i] - asked[i];
+                ${real} terms = ${name}_size(g[i]) + ${name}_size(rhs[i]);
+                r[i] = g[i] - rhs[i];
                 for (j = begin; j < end; j++) {
                     r[i] += ${name}_M[i][j] * v[j];
                     terms += ${name}_size(${name}_M[i][j] * v[j]);
@@ -706,7 +706,7 @@ static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CH
             if (tried || best == 0.0${f})
                 best = worst;
             for (i = begin; i < end; i++) {
-                x[i] = asked[i];
+                x[i] = rhs[i];
                 for (j = begin; j < end; j++)
                     x[i] += ${name}_M[i][j] * ((2.0${f} * g[j] - u[j]) / ${name}_TAU[0][j]);
             }
@@ -736,11 +736,11 @@ static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CH
             for (i = begin; i < end; i++) {
                 for (j = begin; j < end; j++)
                     a[i][j] = ${name}_M[i][j];
-                a[i][end] = asked[i];
+                a[i][end] = rhs[i];
                 g[i] = 0.0${f};
             }
             ${name}_eliminate(a, begin, end, v);
-            found = 0;
+            converged = 0;
         }
         begin = end;
     }
@@ -748,7 +748,7 @@ static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CH
         e[${name}_AT[i]] = v[i];
         f[${name}_AT[i]] = g[i];
     }
-    return found;
+    return converged;
 }
 """
 _LIMITED = """    {

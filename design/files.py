@@ -285,7 +285,7 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
             with place.open("wb") as device:
                 _fill(device, content)
             return path
-        _spare(path)
+        _require_unused(path)
         if ledger := _ledger.get():
             ledger.written |= _places(path)
         handle, name = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.")
@@ -312,12 +312,12 @@ def remove(*paths: Path) -> None:
         for path in paths:
             try:
                 if (place := _target(path)).is_file():
-                    place.unlink() if unlink else _spare(path)
+                    place.unlink() if unlink else _require_unused(path)
             except OSError as error:
                 raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
 
 
-def _spare(path: Path) -> None:
+def _require_unused(path: Path) -> None:
     """Raise InputError if the command has read the file, or has written it and an option names it."""
     if ledger := _ledger.get():
         places = _places(path)
@@ -383,13 +383,13 @@ def write_json(destination: str | Path, report: Any) -> None:
             sys.stdout.write(text)
             sys.stdout.flush()
         except BrokenPipeError:
-            nobody_reads()
+            discard_output()
     else:
         write(Path(destination), text)
 
 
-def nobody_reads() -> None:
-    """Discard further standard output, because the program that read it has ended."""
+def discard_output() -> None:
+    """Discard further standard output, which cannot be written."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

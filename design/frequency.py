@@ -53,7 +53,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 
 
 # ----------------------------------------------------------------------------------------------------
-# `suprema` does the work of `supremum` for many functions of frequency at once, with one row for each function.
+# The suprema of many functions of frequency at once, with one row for each function.
 
 
 _PEAKS = 3  # number of highest local maxima of each function that are refined

@@ -869,8 +869,8 @@ class LimitedKnownDevice(KnownDevice):
     def base(self) -> str:
         return KnownDevice.name if self.name == LimitedKnownDevice.name else self.name
 
-    def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        return self.limiter.lag(loop)
+    def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
+        return self.limiter.limiter_rho(loop)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
         return self.limiter.parameters(loop)
@@ -896,7 +896,7 @@ class _KnownDeviceAny(KnownDevice):
     def members(self, loop: Loop) -> tuple[Member, ...]:
         return ()
 
-    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+    def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
         return (0.0,) * loop.channels if type(self) is _KnownDeviceAny else None
 
     def guarantee(self, loop: Loop) -> Environments:

@@ -494,7 +494,7 @@ class _Search:
         return last
 
     def _between_with_multipliers(self, candidate: Optimal, coupling: ForceFilter, over: Callable[[], bool]) -> Optimal:
-        """Do the work of `between` for a condition that has the same multipliers in all environments."""
+        """Return the coupling, scaled so that one set of multipliers serves all environments, or without a proof."""
         last = candidate
         for _ in range(_SCALINGS):
             needs = required_damping(self.loop, coupling, self.condition)

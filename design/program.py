@@ -49,7 +49,7 @@ _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share o
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
 _RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
 _EDGED = {1: 20, 2: 20}  # least number of taps of a basis with sections at the band's end, by number of channels
-_EDGED_OF_MANY = 6  # the same least number for more than two channels
+_EDGED_OF_MANY = 6  # least number of taps of such a basis for more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of the sections; small, because the error may jump at the band's end
 # Up to FULL channels every force has a filter to every device. With further constraints,
 # a latency or ranges, the limit is FULL_BESIDE.

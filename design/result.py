@@ -75,7 +75,7 @@ class Requirement(Generic[C]):
         bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None. For a
             limiter it is the bound of the block less `Demand.spare`, unless `ratio` is smaller.
         guarantee: The environments for which the condition holds, in words.
-        lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
+        limiter_rho: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
     """
 
@@ -88,7 +88,7 @@ class Requirement(Generic[C]):
     multiplier: tuple[Any, ...] | None = None
     bound: float | None = None
     guarantee: str | None = None
-    lag: tuple[float, ...] | None = None
+    limiter_rho: tuple[float, ...] | None = None
     applies: bool = True
 
     def __repr__(self) -> str:
@@ -272,5 +272,5 @@ class Design(Chosen):
 
 
 def held_torques(loop: Loop) -> str | None:
-    """Return the remark that conditions ignore how the pose changes while torques are held; None without `axes`."""
-    return "not covered: forces are taken as held in space while the pose changes" if loop.axes else None
+    """Return the remark that proofs neglect the change of pose while motors hold torques; None without `axes`."""
+    return "while motors hold torques, the force changes with the pose: not covered" if loop.axes else None

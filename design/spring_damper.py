@@ -263,10 +263,10 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
 
 
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
+    """Return a spring-damper (`design`) that covers limited forces for `limiter` True, does not for False.
 
-    `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if the
-    loop has so many channels that the search would take minutes.
+    For None it covers them if possible. Raises the errors of `design`, and DesignFailed at once if the loop has so many
+    channels that the search would take minutes.
     """
     if not named(condition).extensible:  # With psi = 0 any-environment covers limited forces.
         if limiter and named(condition) is KNOWN_DEVICE:

@@ -26,7 +26,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.certificate import lag, required_damping
+from haptic_loop.design.certificate import limiter_rho, required_damping
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
@@ -555,7 +555,7 @@ class CertifiedCoupling:
         if self.held < 1 or budgeted:
             return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
-        rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # rho of the limiter in the file's proof
+        rho = limiter_rho(self.scenario.loop(self.case), self.chosen.certificate)  # that of the file's proof
         below = "" if rho and rho == self.assessment.force_limits.rho else " while forces stay below their limits"
         return [*said, f"a force that is held through {answers} is covered by the file's proof{below}"]
 

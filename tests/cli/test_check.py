@@ -74,7 +74,7 @@ def test_checking_imports_no_solver(path):
 
 
 def test_an_interruption_exits_with_130(path, monkeypatch):
-    def interrupted(*given):
+    def interrupted(*arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("haptic_loop.cli.check.verify", interrupted)

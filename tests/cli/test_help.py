@@ -24,20 +24,20 @@ class Parsed(Exception):
 
 
 def modules():
-    """Return the names of all commands, as for python -m."""
+    """Return the modules of all commands, as python -m names them."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
     texts = {path: path.read_text() for path in files}
     doors = [path for path in files if DOOR.search(texts[path]) or LAUNCH.search(texts[path])]
-    found = [path.relative_to(ROOT).with_suffix("").parts for path in doors]
-    return [".".join(parts).removesuffix(".__main__") for parts in found]
+    parts = [path.relative_to(ROOT).with_suffix("").parts for path in doors]
+    return [".".join(names).removesuffix(".__main__") for names in parts]
 
 
 def main_of(module):
     path = ROOT / module.replace(".", "/")
     text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
-    if found := DOOR.search(text):
-        assert COMMANDS[found.group(1)][0] == module
-        return importlib.import_module(f"haptic_loop.cli.{found.group(1)}").main
+    if match := DOOR.search(text):
+        assert COMMANDS[match.group(1)][0] == module
+        return importlib.import_module(f"haptic_loop.cli.{match.group(1)}").main
     package = f"{module}.__main__" if path.is_dir() else module
     return getattr(importlib.import_module(package), LAUNCH.search(text).group(1))
 

@@ -224,7 +224,7 @@ def test_design_and_export_make_no_folder(command, tmp_path, monkeypatch, capsys
     assert not Path("nix").exists()
 
 
-@pytest.mark.parametrize("asked", [pytest.param("osmesa", marks=pytest.mark.validate), "bogus"])
+@pytest.mark.parametrize("backend", [pytest.param("osmesa", marks=pytest.mark.validate), "bogus"])
 @pytest.mark.parametrize(
     ("command", "picture"),
     [
@@ -233,9 +233,9 @@ def test_design_and_export_make_no_folder(command, tmp_path, monkeypatch, capsys
         pytest.param("sim.view --coupling none --duration 0.1 --video film.gif", "film.gif", marks=pytest.mark.slow),
     ],
 )
-def test_commands_ignore_mujoco_gl(command, picture, asked, tmp_path):
+def test_commands_ignore_mujoco_gl(command, picture, backend, tmp_path):
     """`import mujoco` alone fails with the backend "bogus", and with "osmesa" if that is not installed."""
-    environment = ENVIRONMENT | {"MUJOCO_GL": asked}
+    environment = ENVIRONMENT | {"MUJOCO_GL": backend}
     words = [sys.executable, "-m", *command.split()]
     done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, "GL" in done.stderr) == (0, False)

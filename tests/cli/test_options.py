@@ -15,16 +15,16 @@ from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 
 
 def parser():
-    made = options.Parser("x", "what", "python -m x")
-    made.add_argument("--count", type=options.whole(1, 9))
-    made.add_argument("--seed", type=options.whole(0))
-    made.add_argument("--length", type=options.number(1e-3, 2, "m"))
-    made.add_argument("--K", type=options.several(float, 0, 1e3, "N/m"))
-    made.add_argument("--theta", type=options.several(int))
-    made.add_argument("--mark", type=options.pair, action="append")
-    made.add_argument("--varying-delay", type=options._delay_ranges)
-    made.add_condition()
-    return made
+    parser_of_x = options.Parser("x", "what", "python -m x")
+    parser_of_x.add_argument("--count", type=options.whole(1, 9))
+    parser_of_x.add_argument("--seed", type=options.whole(0))
+    parser_of_x.add_argument("--length", type=options.number(1e-3, 2, "m"))
+    parser_of_x.add_argument("--K", type=options.several(float, 0, 1e3, "N/m"))
+    parser_of_x.add_argument("--theta", type=options.several(int))
+    parser_of_x.add_argument("--mark", type=options.pair, action="append")
+    parser_of_x.add_argument("--varying-delay", type=options._delay_ranges)
+    parser_of_x.add_condition()
+    return parser_of_x
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_messages_quote_at_most_eighty_printable_characters():
     ("words", "case"),
     [("", "I"), ("--reference II", "II"), ("--case none", "none")],
 )
-def test_reference_and_case_say_one_thing(words, case):
+def test_reference_or_case_sets_the_case(words, case):
     assert run_parser().parse_args(words.split()).case == case
 
 
@@ -119,7 +119,7 @@ def scenario_of(words):
     return options.scenario_from(run_parser().parse_args(words.split()))
 
 
-def test_known_bounds_and_damping_are_both_taken():
+def test_known_device_and_delta_combine():
     """Bounds of --known-device replace those of the scenario, with and without --delta."""
     bounds = "--scenario omega-pair-known --known-device 0.06,14500,0.5,5"
     scenario = scenario_of(f"{bounds} --delta 1.2 --theta 2,2 --latency 1e-4 --T 1e-3")

@@ -20,10 +20,10 @@ JSON = ["--json", "report.json"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with the page's condition in a file, and a spring-damper that `design` made for it."""
+    """Return a folder with the page's condition in a file, and a spring-damper that `design` wrote for it."""
     place = tmp_path_factory.mktemp("own")
-    found = re.search(r"```python\n# joined.py\n(.*?)```", PAGE, re.DOTALL)
-    (place / "joined_devices.py").write_text(found[1])
+    code = re.search(r"```python\n# joined.py\n(.*?)```", PAGE, re.DOTALL)[1]
+    (place / "joined_devices.py").write_text(code)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         assert run("design", "--out", "joined.json", *JSON) == 0
@@ -118,7 +118,7 @@ def test_a_file_without_its_condition_is_explained(folder, monkeypatch):
 )
 def test_designs_without_own_conditions_are_refused(words, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("haptic_loop.design.api.instead", lambda *failed: "")  # which designs other couplings
+    monkeypatch.setattr("haptic_loop.design.api.instead", lambda *failed: "")  # It would design other couplings.
     with pytest.raises(ValueError, match=message) as caught:
         run("design", *words)
     assert "\n" not in str(caught.value)
@@ -135,22 +135,22 @@ def test_designs_without_own_conditions_are_refused(words, message, folder, monk
         ("this-env", "allowed are this-environment, .*FILE.py:NAME"),
     ],
 )
-def test_a_condition_that_is_none_is_refused(named, message, folder, monkeypatch):
+def test_objects_other_than_conditions_are_refused(named, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError, match=message):
         import_module("haptic_loop.cli.design").main(["--condition", named])
 
 
-def test_python_takes_the_conditions_class(folder, monkeypatch):
+def test_python_functions_accept_an_own_condition(folder, monkeypatch):
     monkeypatch.chdir(folder)
     own = import_module("joined_devices").JoinedDevices()
     loop = load("omega-pair").loop("I")
-    made = design_coupling(loop, "moving-average", own)
-    assert (made.condition, made.own) == (NAME, own)
-    needs = certify(loop, made)
+    design = design_coupling(loop, "moving-average", own)
+    assert (design.condition, design.own) == (NAME, own)
+    needs = certify(loop, design)
     assert needs[NAME].proof == "rational"
-    assert certify(loop, made.coupling, own)[NAME].required == needs[NAME].required
-    assert NAME not in certify(loop, made.coupling)
+    assert certify(loop, design.coupling, own)[NAME].required == needs[NAME].required
+    assert NAME not in certify(loop, design.coupling)
     # with Delta = 1.37 I the block would be that of this-environment; the full matrix's eigenvalues bound the ratio
     assert 1 / 1.57 < needs[NAME].ratio / needs["this-environment"].ratio / 1.37 < 1 / 1.17
     assert np.isfinite(needs["any-environment"].ratio)
@@ -186,8 +186,8 @@ class Never(Condition):
 def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "never.py").write_text(NEVER)
-    asked = ["--coupling", "joined.json", "--condition", "never.py:Never"]
-    assert import_module(f"haptic_loop.cli.{command}").main([*asked, *words, *JSON]) == code
+    options = ["--coupling", "joined.json", "--condition", "never.py:Never"]
+    assert import_module(f"haptic_loop.cli.{command}").main([*options, *words, *JSON]) == code
     text = Path("report.json").read_text()
     assert "fails the condition never: needs 2." in text
     assert CLAIMED not in text
@@ -201,7 +201,7 @@ def test_only_the_given_condition_arms_a_device(folder, monkeypatch):
         certified_coupling(load("omega-pair"), "I", "joined.json", own, 1)
 
 
-def test_an_exported_block_says_what_is_proved(folder, monkeypatch, capsys):
+def test_exported_blocks_state_the_claim_of_own_conditions(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert run("export", "joined.json", "--out", "joined.c", *JSON) == 0
     assert CLAIMED in capsys.readouterr().out

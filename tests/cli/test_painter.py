@@ -47,7 +47,7 @@ assert "matplotlib" not in sys.modules
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Return the picture as a process draws it that speaks of metres, as most do."""
+    """Return the picture of a process whose unit is the metre."""
     return plots.png(plots.draw_run(*SHOWN))
 
 
@@ -78,7 +78,7 @@ def test_an_unwanted_painter_starts_no_process(monkeypatch):
 
 
 def test_a_painter_without_picture_ends_its_process(monkeypatch):
-    """A command that fails leaves no process behind, of which Popen would warn."""
+    """A failing command leaves no process behind; Popen would warn of one."""
     monkeypatch.delitem(sys.modules, "matplotlib")
     started, start = [], subprocess.Popen
     monkeypatch.setattr(

@@ -93,8 +93,8 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
         of = [] if command in ("check", "export", "trace") else ["--scenario", str(WHEEL)]
         assert import_module(f"haptic_loop.cli.{command}").main([*words, *of]) == 0
         report = out / "report.json"
-        told = " ".join(capsys.readouterr().out.split()) + (report.read_text() if report.exists() else "")
-        assert not (found := LINEAR.search(told)), (command, told[found.start() - 80 : found.end() + 80])
+        printed = " ".join(capsys.readouterr().out.split()) + (report.read_text() if report.exists() else "")
+        assert not (match := LINEAR.search(printed)), (command, printed[match.start() - 80 : match.end() + 80])
     assert (out / "trace.csv").read_text().splitlines()[0] == "t [s],x1 [rad],f1 [N m]"
     assert json.loads(report.read_text())["session"]["stage"] == "finished"
     assert not LINEAR.search((out / "incidents.jsonl").read_text())

@@ -119,7 +119,7 @@ def test_published_gains_are_refused_by_their_own_condition(tmp_path):
 def test_impossible_settings_are_refused_before_designs(command, words, monkeypatch):
     """Settings are checked before the design, which may take minutes."""
     module = import_module(f"haptic_loop.cli.{command}")
-    monkeypatch.setattr(module, "chosen_by", lambda *asked: pytest.fail("a coupling was designed"))
+    monkeypatch.setattr(module, "chosen_by", lambda *arguments: pytest.fail("a coupling was designed"))
     with pytest.raises(InputError, match=words.split()[-2]):
         module.main(words.split())
 
@@ -299,14 +299,14 @@ def test_a_requested_error_chooses_the_engine(tmp_path, capsys):
     file = tmp_path / "r.json"
     options = ["--case", "I", "--duration", "0.4", "--no-plot", "--out", str(tmp_path)]
     assert main([*options, "--error", "1e-9", "--cross-check", "--json", str(file)]) == 0
-    done = json.loads(file.read_text())["run"]
-    assert (done["integrator"], done["substeps"]) == ("exponential", 1)
-    errors = {(row["integrator"], row["substeps"]): row["position_relative_rms"] for row in done["engines"]}
+    ran = json.loads(file.read_text())["run"]
+    assert (ran["integrator"], ran["substeps"]) == ("exponential", 1)
+    errors = {(row["integrator"], row["substeps"]): row["position_relative_rms"] for row in ran["engines"]}
     assert errors["exponential", 1] < 1e-11
     assert errors["RK4", 8] < errors["RK4", 4] < errors["Euler", 4]
-    evaluations = [row["substeps"] * (4 if row["integrator"] == "RK4" else 1) for row in done["engines"]]
+    evaluations = [row["substeps"] * (4 if row["integrator"] == "RK4" else 1) for row in ran["engines"]]
     assert evaluations == sorted(evaluations)
-    check = done["cross_check"]
+    check = ran["cross_check"]
     assert (check["integrator"], check["substeps"], check["agrees"]) == ("RK4", 4, True)
     assert 0 < check["position_relative_rms"] < 1e-6
     assert "RK4 x 4" in capsys.readouterr().out
@@ -327,8 +327,8 @@ def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
         coupling = ["--coupling", f"{name}/mine.py:{name}", "--scenario", f"{name}/loop.toml"]
         assert main([*coupling, "--duration", "0.01", "--no-plot"]) == 0
     sys.modules.pop("mine", None)
-    found = [json.loads(file.read_text())["assessment"]["coupling"]["K"] for file in Path("out").glob("*/report.json")]
-    assert sorted(found) == [[K, K] for K in stiffness.values()]
+    reports = [json.loads(file.read_text())["assessment"]["coupling"] for file in Path("out").glob("*/report.json")]
+    assert sorted(coupling["K"] for coupling in reports) == [[K, K] for K in stiffness.values()]
 
 
 def test_files_elsewhere_are_named_with_their_folder(tmp_path, monkeypatch):

@@ -46,7 +46,7 @@ def test_text_wraps_at_the_terminals_width():
 def test_every_report_is_printed_on_a_screen():
     """A bare rich Console cuts numbers: only the progress bar may use one."""
     bare = set()
-    for path in (file for world in ("design", "sim", "hw", "cli") for file in (ROOT / world).rglob("*.py")):
+    for path in (file for folder in ("design", "sim", "hw", "cli") for file in (ROOT / folder).rglob("*.py")):
         if "Console" not in (text := path.read_text()):
             continue
         calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))

@@ -131,7 +131,7 @@ def test_a_users_condition_must_name_switching_delays():
     class Own(ThisEnvironment):
         name = "own"
 
-        def lag(self, loop):
+        def limiter_rho(self, loop):
             return (0.0,) * loop.channels
 
     switching = change(LOOP, varying_delay=DelayRange((2,), (3,)), delta=(1.4 * 1.37,))

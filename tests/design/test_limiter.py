@@ -13,7 +13,7 @@ from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, Sampled, taps
 from haptic_loop.design import budgets, environments
-from haptic_loop.design.certificate import lag, prove, required_damping, verify
+from haptic_loop.design.certificate import limiter_rho, prove, required_damping, verify
 from haptic_loop.design.conditions import _least_multiple
 from haptic_loop.design.coupling_file import Certificate, Stored, load, save, sealed
 from haptic_loop.design.environments import LIMITER, LimitedForces
@@ -212,7 +212,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
     proof = read.certificate
     assert (proof.condition, proof.facts) == ("this-environment", ("limiter",))
     assert proof.multipliers["rho"] == LAG
-    assert lag(PAIR, read.certificate) == LAG
+    assert limiter_rho(PAIR, read.certificate) == LAG
     assert proof.required == pytest.approx((1.32327, 1.32327), abs=5e-6)
     assert proof.margin == pytest.approx(1.37 / 1.32327, rel=1e-5)
 
@@ -222,7 +222,7 @@ def test_linear_proofs_survive_a_refused_limiter(tmp_path):
     stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert plain.facts == ()
-    assert lag(PAIR, plain) is None
+    assert limiter_rho(PAIR, plain) is None
     with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
         prove_limiter(PAIR, stiff)
 
@@ -230,7 +230,7 @@ def test_linear_proofs_survive_a_refused_limiter(tmp_path):
 def test_any_environment_covers_the_limiter():
     soft = SpringDamper((879.0, 552.0), (0.39, 0.52))
     loop = msgspec.structs.replace(PAIR, delta=(1.4, 1.4))
-    assert lag(loop, prove(loop, soft, "any-environment")) == (0.0, 0.0)
+    assert limiter_rho(loop, prove(loop, soft, "any-environment")) == (0.0, 0.0)
 
 
 def tampered(stored, **fields):
@@ -273,8 +273,8 @@ def test_any_environment_with_psi_covers_no_limiter():
     some = Certificate(
         "any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, {}, "", {}
     )
-    assert lag(PAIR, some) == (0.0, 0.0)
-    assert lag(loop, some) is None
+    assert limiter_rho(PAIR, some) == (0.0, 0.0)
+    assert limiter_rho(loop, some) is None
 
 
 # Designs
@@ -302,7 +302,7 @@ def test_the_command_stores_proofs_of_limited_forces(tmp_path):
     assert design_main(["--condition", "this-environment", "--limiter", "--out", str(out)]) == 0
     stored = load(out)
     assert verify(stored).proved
-    assert lag(stored.loop, stored.certificate) == LAG
+    assert limiter_rho(stored.loop, stored.certificate) == LAG
     with pytest.raises(InputError, match=r"--limiter is for --coupling .*, not ccl"):
         design_main(["--coupling", "ccl", "--limiter", "--out", str(out)])
 

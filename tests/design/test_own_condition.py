@@ -14,7 +14,7 @@ from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, as_like, constant_like, numbers, taps
 from haptic_loop.design import compare
 from haptic_loop.design.assessment import _covered_limits, assess
-from haptic_loop.design.certificate import lag, prove, required_damping, requirements_of, verify
+from haptic_loop.design.certificate import limiter_rho, prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import BEYOND, Condition, Demand
 from haptic_loop.design.coupling_file import Stored, filed, sealed
 from haptic_loop.design.environments import SWITCHING, SwitchingDelays
@@ -211,8 +211,8 @@ def test_an_own_fact_is_proved_and_mapped(repeats):
 
 
 def test_own_conditions_cover_no_limited_forces():
-    assert lag(PAIR, prove(PAIR, SOFT, Plain())) is None
-    assert lag(PAIR, prove(PAIR, SOFT, "any-environment")) == (0.0, 0.0)
+    assert limiter_rho(PAIR, prove(PAIR, SOFT, Plain())) is None
+    assert limiter_rho(PAIR, prove(PAIR, SOFT, "any-environment")) == (0.0, 0.0)
 
 
 class Anywhere(Plain):

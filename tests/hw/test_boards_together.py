@@ -242,8 +242,8 @@ def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypat
     ("options", "word"),
     [
         (["--port=/dev/a,/dev/b,/dev/c"], "3 ports, the scenario 2 devices"),
-        (["--port=/dev/a,/dev/b", "--latch=arrival"], "--latch arrival counts forces by one clock"),
-        (["--port=/dev/a,/dev/b", "--energy-budget=0.1"], "--energy-budget counts forces by one clock"),
+        (["--port=/dev/a,/dev/b", "--latch=arrival"], "--latch arrival needs one clock for all devices"),
+        (["--port=/dev/a,/dev/b", "--energy-budget=0.1"], "--energy-budget needs one clock for all devices"),
     ],
 )
 def test_what_two_clocks_do_not_cover_is_refused(options, word):

@@ -68,7 +68,7 @@ def limited_and_idle(scenario, coupling, condition):
     scenario = scenario.replace(device=free, duration=0.5)
     requirements = certify(scenario.loop("I"), coupling)
     assert requirements[condition].ratio < 0.95
-    simulation = assemble(scenario, coupling, requirements[condition].lag)
+    simulation = assemble(scenario, coupling, requirements[condition].limiter_rho)
     figures = run(netted(simulation, EnergyNet(1e-4)), "exact").net.figures()
     return figures.limited_ticks, idle(simulation, requirements, figures)
 
