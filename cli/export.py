@@ -16,7 +16,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.units import comments_in_unit, set_unit
-from haptic_loop.design.certificate import Verdict, named, verify
+from haptic_loop.design.certificate import Verdict, limiter_rho, named, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.export import (
@@ -80,7 +80,8 @@ def main(argv: list[str]) -> int:
     test = trial(block)
     write(path, comments_in_unit(c_source(block, test, path.name)))
 
-    forces = "not limited in this file: a proof covers forces below the motors' limits (--force-limit adds the limiter)"
+    forces = "not limited in this file: a proof covers forces below the motors' limits"
+    forces += " (--force-limit adds the limiter)" if limiter_rho(stored.loop, stored.certificate) is not None else ""
     if block.limiter:
         limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
         forces = (
@@ -125,7 +126,7 @@ def _parser() -> options.Parser:
     limit = "add the limiter that the certificate covers, with these largest forces [N]: one for all, one for each "
     limit += "device (length of its force vector) or one for each axis"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
-    single = "compute in single precision, for processors without double; its error is printed"
+    single = "compute in single precision, for processors without double precision; its error is printed"
     parser.add_argument("--float", action="store_true", help=single)
     parser.add_condition("the condition of the file's certificate, needed only if it is your own")
     parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)", seed=False)

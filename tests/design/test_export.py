@@ -434,6 +434,12 @@ def test_an_uncertified_export_exits_with_1(place, tmp_path, capsys):
     assert "NOT CERTIFIED" in out.read_text()
 
 
+@pytest.mark.parametrize(("name", "offered"), [("gains", True), ("springs", False)])
+def test_the_limiter_is_offered_only_if_certified(place, capsys, name, offered):
+    export(place, name, "--process")
+    assert ("--force-limit" in capsys.readouterr().out) == offered
+
+
 def test_a_hostile_name_stays_inside_the_comment(tmp_path):
     path = tmp_path / "a*\nint hostile;#.json"
     save(Stored.of(PAIR, SOFT), path)
