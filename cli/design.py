@@ -397,7 +397,7 @@ class _Report:
     stored: Filed = render.several(_stored_rows)
     interrupted: bool = off_table()
     claim: str | None = render.figure("claim", default=None, json="if given")  # for the user's own condition
-    compared: str | None = render.figure("compared", default=None, json="if given")  # other certificates
+    compared: str | None = render.figure("compared", default=None, json="if given")  # figures for another condition
 
     @property
     def aim(self) -> str:

@@ -169,14 +169,14 @@ def _sitting(
     number: int,
     clamped: float | None = None,
 ) -> _Sitting:
-    """Play the excitation to every axis, record the motion and estimate.
+    """Play the excitation to every axis, record the motion and estimate the parameters.
 
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise: the options are figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] stops a device that is lighter than declared
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
     axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
     vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
     session = session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)

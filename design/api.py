@@ -218,12 +218,7 @@ def proved(loop: Loop, design: Design) -> Design:
         return design
 
 
-def store(
-    loop: Loop,
-    design: Design,
-    path: Path,
-    assessment: Assessment | None = None,
-) -> Filed:
+def store(loop: Loop, design: Design, path: Path, assessment: Assessment | None = None) -> Filed:
     """Save the coupling with its proof, and return a summary of the file.
 
     `assessment` may contain proofs for ranges and for limited forces. If the ranges are not proved by the design's

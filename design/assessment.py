@@ -65,7 +65,7 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-#: A user's function u -> force (m,) [N]; u (m,) [m] would be the environment's displacements without the present force.
+#: A user's function u -> force (m,) [N]. u (m,) [m] are the environment's displacements without this tick's force.
 PluggedEnvironment = Callable[[Array], Array]
 
 

@@ -18,10 +18,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.arithmetic import TooLong
-from haptic_loop.controller.coupling import (
-    Coupling,
-    SpringDamper,
-)
+from haptic_loop.controller.coupling import Coupling, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import conditions_of, named
@@ -385,6 +382,7 @@ def audit(
     Args:
         loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
+        condition: The condition that must hold; None for this-environment, or known-device for known devices.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
         force_limit: (m,) force limits [N], for the report.
         progress: Called with (points done, number of points) of the search over ranges.

@@ -71,8 +71,8 @@ BETA_CUTS, BETA_ROUNDS = 40, 60
 #: on faces and inside. RANGE_STARTS compass searches follow. Up to five parameters this takes the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
-# Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the
-# default designs of cases I and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) -------------------
+# Steps of iterations that converge. Brackets hold the largest number in the optimal and the default designs of cases I
+# and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) ----------------------------------------------
 
 #: Newton steps to the centre of a barrier (9 centrings took all 60 and returned the last point), and of the primal-dual
 #: method (two runs took all 60 because of rounding).

@@ -51,8 +51,7 @@ _RICH = 8  # largest number of channels for which the basis has second-order sec
 _EDGED = {1: 20, 2: 20}  # least number of taps of a basis with sections at the band's end, by number of channels
 _EDGED_OF_MANY = 6  # least number of taps of such a basis for more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of the sections; small, because the error may jump at the band's end
-# Up to FULL channels every force has a filter to every device. With further constraints,
-# a latency or ranges, the limit is FULL_BESIDE.
+# Up to FULL channels (FULL_BESIDE with further constraints, a latency or ranges) R has a filter for each pair of them.
 FULL, FULL_BESIDE = 8, 5
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the mismatch, up to _RICH channels and above
 HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.

@@ -28,8 +28,8 @@ from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 from tests.evaluate import decisive, needs, safe_with
 
-SECTIONS = {"case", "scenario", "assessment", "stability"}
-SECTIONS |= {"run", "error", "files"}
+ROOT = Path(__file__).parents[2]
+SECTIONS = {"case", "scenario", "assessment", "stability", "run", "error", "files"}
 
 
 def run(tmp_path, *options):
@@ -208,7 +208,7 @@ def test_bad_options_leave_no_files(options, message, tmp_path, monkeypatch):
 
 
 def command(*options, **kwargs):
-    environment = {"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin"}
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
     return subprocess.Popen(
         [sys.executable, "-m", "sim.run", *options],
         stdout=subprocess.PIPE,
@@ -229,7 +229,7 @@ def test_bad_input_gets_one_line_and_exit_2(tmp_path):
 
 @pytest.mark.slow
 def test_impossible_designs_exit_with_1(tmp_path):
-    one_device = str(Path(__file__).parents[2] / "benchmarks/loops/n3-free1.toml")
+    one_device = str(ROOT / "benchmarks/loops/n3-free1.toml")
     words = ["--scenario", one_device, "--psi", "1", "--delta", "0.1", "--condition", "any-environment"]
     done = forked.run(["python", "-m", "sim.run", *words], tmp_path)
     *waiting, refusal = done.stderr.splitlines()
@@ -251,10 +251,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # without the tests' cache
     monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # stop after the first basis, which reports its error
-    one_device = (
-        "--scenario",
-        str(Path(__file__).parents[2] / "benchmarks/loops/o13-no-mass.toml"),
-    )  # designed in a second
+    one_device = "--scenario", str(ROOT / "benchmarks/loops/o13-no-mass.toml")  # designed in a second
     code, _ = run(tmp_path, *one_device, "--coupling", "optimal", "--duration", "0.1", "--no-plot")
     shown, err = capsys.readouterr()
     assert code == 0
