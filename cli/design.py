@@ -191,7 +191,7 @@ def _decaying_design(
         part = msgspec.structs.replace(loop, delta=tuple(share * delta for delta in loop.delta))
         design = make(part)
         if share < 1:
-            needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
+            needs = named(design.required_condition).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
         decay = ringing(assemble(scenario, design.coupling))
         assert decay  # Worlds are refused, and with the spring of a coupling not all modes are free drifts.
@@ -230,7 +230,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             loop,
             design.coupling,
             certificate=design.certificate,
-            condition=design.asked,
+            condition=design.required_condition,
             ranges_seed=args.seed,
             searched=design.searched,
             limiter=args.limiter,
@@ -265,7 +265,7 @@ def _bound_and_robustness(
                 band, chosen = args.band_hz or BAND_HZ, Options(**_options_of(args, "optimal"))
                 limit = BoundBeside.of(loop, design, design.figures.rms_mismatch_db, band, chosen, begun)
         with render.progress(f"{note}: computing robustness"):
-            return limit, robustness_nearby(loop, design.coupling, named(design.asked)), False
+            return limit, robustness_nearby(loop, design.coupling, named(design.required_condition)), False
     except KeyboardInterrupt:
         return limit, None, True
 

@@ -187,14 +187,14 @@ def shortened(rows: Rows, less: Sequence[str], others: int = 0) -> tuple[list[tu
     While there are more than _MOST_ROWS rows, counting `others` of further tables, rows named in `less` are left out,
     in this order. A row without a name belongs to the row before it.
     """
-    kept, out = [row for row in rows if row[1] is not None], []
-    names = list(accumulate((name for name, _ in kept), lambda before, name: name or before))
+    remaining, out = [row for row in rows if row[1] is not None], []
+    names = list(accumulate((name for name, _ in remaining), lambda before, name: name or before))
     for name in less:
-        if len(kept) + others > _MOST_ROWS and name in names:
-            kept = [row for row, of in zip(kept, names, strict=True) if of != name]
+        if len(remaining) + others > _MOST_ROWS and name in names:
+            remaining = [row for row, of in zip(remaining, names, strict=True) if of != name]
             names = [of for of in names if of != name]
             out.append(name)
-    return kept, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
+    return remaining, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
 
 
 _MOST_ROWS = 15  # number of rows that `shortened` allows

@@ -167,7 +167,7 @@ def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robust
     guarantee = assessment.guarantee
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
         return None
-    return Forked(robustness_nearby, loop, chosen.coupling, named(chosen.asked))
+    return Forked(robustness_nearby, loop, chosen.coupling, named(chosen.required_condition))
 
 
 def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:

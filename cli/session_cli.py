@@ -282,7 +282,7 @@ def hold_session(
 
 
 def _logged(session: Session, out: Path) -> IncidentLog:
-    """Return the incident log of a session whose device is open: a missing port leaves no file."""
+    """Return the incident log of a session whose device is open, so that a missing port leaves no file."""
     incidents = IncidentLog(out / "incidents.jsonl")
     incidents.attach(session)
     return incidents

@@ -231,12 +231,12 @@ def store(loop: Loop, design: Design, path: Path, assessment: Assessment | None 
     if ranges and ranges.proved and ranges.certificate and ranges.certificate.condition == design.condition:
         certificate, reason = ranges.certificate, None
     else:
-        loop = loop if named(design.asked).guarantee(loop) == ANY else loop.at(loop.environment)
+        loop = loop if named(design.required_condition).guarantee(loop) == ANY else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, limiter)
     switching = None
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
-        words = f"{switching_guarantee(loop.varying_delay)}, in {named(design.asked).guarantee(loop)}"
+        words = f"{switching_guarantee(loop.varying_delay)}, in {named(design.required_condition).guarantee(loop)}"
         stated = words if assessment is None or assessment.guarantee else None
         switching = _SwitchingFiled(stated, proof, reason)
         if certificate is None:
@@ -252,7 +252,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
     The certificate `limiter`, which covers limited forces, is preferred if it belongs to this loop.
     """
-    limited = limiter if named(design.asked).extensible else None
+    limited = limiter if named(design.required_condition).extensible else None
     for certificate in (limited, design.certificate):
         if certificate and certificate.scenario == digest(loop, design.coupling.form()):
             return certificate, None
@@ -267,7 +267,7 @@ def _certificate(loop: Loop, design: Design) -> Certificate:
     if design.c:
         with suppress(NotProved):
             return prove(loop, design.coupling, LIMITER, [v for row in design.c for v in row])
-    return prove(loop, design.coupling, design.asked, None if design.phi is None else design.phi.tolist())
+    return prove(loop, design.coupling, design.required_condition, None if design.phi is None else design.phi.tolist())
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

@@ -676,9 +676,9 @@ def assess(
     """
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
     if isinstance(coupling, Design):
-        certificate, condition = certificate or coupling.certificate, condition or coupling.asked
-        made = coupling.certificate  # The design's search is for this loop only if its proof is.
-        own_search = coupling.searched if made and made.scenario == digest(loop, coupling.coupling.form()) else None
+        certificate, condition = certificate or coupling.certificate, condition or coupling.required_condition
+        proof = coupling.certificate  # The design's search is for this loop only if its proof is.
+        own_search = coupling.searched if proof and proof.scenario == digest(loop, coupling.coupling.form()) else None
         searched, limiter_c, coupling = searched or own_search, limiter_c or coupling.c, coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
     require_channels(coupling.form(), loop.channels)

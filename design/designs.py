@@ -243,7 +243,7 @@ def _in_principal_axes(
         Q[own, own] = np.linalg.eigh(Delta[own, own])[1]
     values = (1 - _ROUNDED) * np.diag(Q.T @ Delta @ Q)
 
-    def made(part: Loop) -> Design:
+    def straight_design(part: Loop) -> Design:
         """Return the design for `part`, the loop with a share of its damping and with all walls touching."""
         delta = tuple((part.delta[0] / loop.delta[0] * values).tolist())
         straight = {"environment": _Turned(loop.environment, Q), "delta": delta, "levels": None, "ranges": None}
@@ -253,8 +253,8 @@ def _in_principal_axes(
         return replace(design, coupling=coupling, requirement=requirement, certificate=None)
 
     if loop.environment.walls and condition.guarantee(loop) != ANY:
-        return _with_less_damping(loop, made, condition)
-    design = made(loop)
+        return _with_less_damping(loop, straight_design, condition)
+    design = straight_design(loop)
     if not design.requirement.certified:
         why = f"the designed coupling is not certified by {condition.name}: {design.requirement.shortfall}"
         raise DesignFailed(None, (), why)

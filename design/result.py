@@ -221,7 +221,7 @@ class Chosen:
     certified_for: Network | None = field(kw_only=True, default=None)
 
     @property
-    def asked(self) -> Any:
+    def required_condition(self) -> Any:
         """The user's own condition, or the name of the condition."""
         return self.own or self.condition
 

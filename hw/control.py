@@ -662,8 +662,8 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
     later = np.greater(reserve.scenario.theta, than.scenario.theta)
     if (before * (1 + _EQUAL) < K).any() or (later & (before * (1 - _EQUAL) <= K)).any():
         return False
-    loop = reserve.scenario.loop(reserve.case)
-    needs = [required_damping(loop, each.chosen.coupling, than.chosen.asked).ratio for each in (reserve, than)]
+    loop, condition = reserve.scenario.loop(reserve.case), than.chosen.required_condition
+    needs = [required_damping(loop, each.chosen.coupling, condition).ratio for each in (reserve, than)]
     return needs[0] < needs[1]
 
 

@@ -230,7 +230,7 @@ def assessed(
         environment=environment,
         energy_budget=energy_budget,
         certificate=chosen.certificate,
-        condition=chosen.asked,
+        condition=chosen.required_condition,
         ranges_seed=seed,
         limiter=limiter,
         limiter_proof=chosen.limiter,

@@ -85,7 +85,7 @@ class RunReport:
         certificates, part = self.assessment.requirements, self.assessment.decisive
         transparency, where = self.assessment.transparency, guarantee and guarantee.environments
         if not part.certified and not part.reason:
-            source = named(self.chosen.asked).source
+            source = named(self.chosen.required_condition).source
             condition = f"the {part.condition} condition" + (f" ({source})" if source else "")
             subject = "The loop without" if self.kind == "none" else "This"
             needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"

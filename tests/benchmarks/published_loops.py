@@ -71,7 +71,7 @@ def best(path: Path) -> dict[str, float | None]:
             made = design_by_kind(loop, kind, condition, **switching)
         except ValueError:
             continue  # The design finds no coupling, or refuses this loop, for example because of its walls.
-        if assess(loop, made, condition=SWITCHING if switching else made.asked).holds:
+        if assess(loop, made, condition=SWITCHING if switching else made.required_condition).holds:
             seen = transparency_of(loop, made)
             reached.append((seen.rms_mismatch_db, seen.dc_ratio))
     rms, share = min(reached)

@@ -235,7 +235,7 @@ def test_impossible_designs_exit_with_1(tmp_path):
     *waiting, refusal = done.stderr.splitlines()
     assert done.returncode == 1
     assert refusal.startswith("not possible: Theorem 4 admits no coupling")
-    assert "use " not in refusal  # no design is proposed that was not tried
+    assert "use " not in refusal  # only designs that were tried are proposed
     assert all(line.endswith(" ..") for line in waiting)  # progress lines, on a slow machine
 
 
