@@ -31,8 +31,6 @@ _EXAMPLES = (
 
 @dataclass(frozen=True)
 class _CatalogueDevice:
-    """A device of the catalogue."""
-
     name: str
     listed: Listed = off_table("inlined")
 

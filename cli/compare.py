@@ -221,8 +221,8 @@ def _guarantees(report: Comparison) -> render.Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = (
-        f"{damping} (available: {_list(available)} N s/m; at 10 %: the largest requirement when a stiffness or mass "
-        f"changes by +10 % or -10 %) · {report.scenario}, case {report.case}"
+        f"{damping} (available: {_list(available)} N s/m; at 10 %: the largest requirement when a stiffness, all of "
+        f"them or a mass change by +10 % or -10 %) · {report.scenario}, case {report.case}"
     )
     scale = available[0] if alike else 1.0
     cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
@@ -263,7 +263,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return `scale` times the largest required over available damping when a parameter changes by +10 % or -10 %."""
+    """Return `scale` times the largest required over available damping after changes of the environment by 10 %."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"

@@ -48,8 +48,6 @@ class _Proof:
 
 @dataclass(frozen=True)
 class _Exported:
-    """The report of an export."""
-
     what: str
     states: int
     T_s: float

@@ -302,7 +302,7 @@ def robustness_rows(there: Robustness | None) -> Rows:
     """Yield rows on the damping that is required if the environment's model is wrong."""
     if there:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
-        yield "robustness", f"{words}, the worst environment within {there.percent:g} %"
+        yield "robustness", f"{words}, the worst of the tried changes by {there.percent:g} %"
         if there.required_over_available > _MUCH:
             yield "", f"python -m design --ranges {there.percent:g}% designs for all of these environments"
 

@@ -14,8 +14,6 @@ from haptic_loop.hw.recording import load, replay
 
 @dataclass(frozen=True)
 class _Compared:
-    """The report of a replay."""
-
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
     filled_in: int = render.figure("ticks without a STATE")

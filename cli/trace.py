@@ -16,8 +16,6 @@ _ZOOM_HZ = 10.0  # frequency of the picture's zoom if nothing oscillates
 
 @dataclass(frozen=True)
 class _Traced:
-    """The report of a trace."""
-
     trace: str
     ticks: int
     duration_s: float

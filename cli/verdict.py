@@ -61,7 +61,7 @@ _OBJECTS = {
 def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     """Return the verdict in a few sentences: hands and objects of the guarantee, felt stiffness, restrictions.
 
-    `nearby` is the required damping in environments within ten percent, or None.
+    `nearby` is the required damping after changes of the environment by ten percent, or None.
     """
     guarantee, encoder = assessment.guarantee, assessment.encoder
     if guarantee is None:
@@ -102,7 +102,7 @@ def _useless(assessment: Assessment) -> str:
 
 
 def lost(assessment: Assessment, nearby: Robustness | None) -> str:
-    """Name the change of the environment within ten percent that ends the guarantee, or return ""."""
+    """Name the change of the environment by ten percent that ends the guarantee, or return ""."""
     guarantee = assessment.guarantee
     if nearby is None or nearby.certified or guarantee is None or guarantee.any_environment:
         return ""

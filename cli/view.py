@@ -130,8 +130,6 @@ class _Clock:
 
 @dataclass(frozen=True)
 class _Ended:
-    """The end of a session."""
-
     interrupted: bool
     video: _Film | None = off_table("if given", None)
     clock: _Clock | None = off_table("if given", None)
@@ -139,8 +137,6 @@ class _Ended:
 
 @dataclass(frozen=True)
 class _Report:
-    """The report of a session."""
-
     case: str
     scenario: str
     simulated_s: float

@@ -96,7 +96,7 @@ def coupling_block(stored: Stored) -> ExportedBlock:
     """Return the block V(z) from forces to displacements. Raises ValueError for a coupling without a V around Psi E."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
-        reason = "this coupling is not a V in feedback around the environment; export its process with --process"
+        reason = "this coupling has no V(z) in feedback around the environment; export its process with --process"
         raise ValueError(reason)
     about = ("d = V f: the deflection of the coupling. In its loop the environment sees u = x - d, and f = Psi E u.",)
     return ExportedBlock("coupling", _with_a_state(V), _FORCE, _DEFLECTION, about)

@@ -73,7 +73,6 @@ def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
 
 @pytest.mark.parametrize("module", modules())
 def test_help_says_what_every_option_is(module, capsys, monkeypatch):
-    """Every option has a help text."""
     parse = Parser.parse_args
     seen = []
 
