@@ -81,12 +81,11 @@ def host_controller(
     behind: Sequence[int] = (),
     balls: Sequence[slice] = (),
 ) -> Controller:
-    """Return a controller for the loop, at rest and without the delay of `link` ticks that the link adds.
+    """Return a controller for the loop, at rest and without the delay that the link adds.
 
-    With several boards, the link adds `link` + `behind` (m,) ticks.
-
-    With `lag`, the rho (m,) [N/m] of a limiter, forces are limited to `cap` (m,) [N]. The channels of each slice in
-    `balls` are limited as one vector. Raises ValueError where the link is slower than a delay of the loop.
+    The link adds `link` ticks; several boards add `behind` (m,) more. With `lag`, the rho (m,) [N/m] of a limiter,
+    forces are limited to `cap` (m,) [N], and the channels of each slice in `balls` as one vector.
+    Raises ValueError where the link is slower than a delay of the loop.
     """
     waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
     return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
@@ -270,7 +269,7 @@ class Arming:
     program: Armable
     config: Config  # configuration of the device
     budget: SentBudget | None = None
-    test_plan: BudgetPlan | None = None  # plan for motor tests in a world; None if the shell limits them
+    test_plan: BudgetPlan | None = None  # plan for motor tests in a world with theta > 0; otherwise None
 
 
 class Drive:
@@ -363,7 +362,7 @@ class Drive:
             if closing and self._last_test and self.gain == 0:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain == 0 and test is None
-        limited = self._counters.limited
+        before = self._counters.limited
         shaped = self.limits.shape(wanted, self.force, self.gain, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
         if budget := self._arming.budget:
@@ -378,8 +377,8 @@ class Drive:
         self._counters.slowed += shaped.slowed
         if self._commands:
             self._commands.tell(state.tick, steps)
-        limits = self._counters.limited > limited
-        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test, limits))
+        limited = self._counters.limited > before
+        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test, limited))
         return steps
 
     def _through_shell(

@@ -24,7 +24,7 @@ _IMPULSE = 0.1  # [s] largest time integral of changes above 1 N without a motio
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
 _PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions always mix
-_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if it needs over _TEST_FORCE; 0.4 if one direction is dead
+_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if it needs over _TEST_FORCE; 0.4 with a one-sided motor
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio of a motion to the expected motion, or of the expected motion to it
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 2e-5 of a motion at 2 Hz
@@ -36,8 +36,8 @@ _CROSS = 0.25  # largest motion of another axis, as a share of the expected moti
 _ALIVE = 0.06
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
 _ZONE = 0.8  # least ratio of a motion's relative size to that under twice the force; 1 without a dead zone
-_CLEAN, _RUBBED = 0.15, 0.25  # for _ZONE: largest one-sided share, largest friction as a share of the force
-_BETTER = 8.0  # least ratio of squares that a one-sided fault explains to the rest; friction and weight reach 6
+_CLEAN, _RUBBED = 0.15, 0.25  # dead zones are judged up to this one-sided share and this ratio of friction to force
+_BETTER = 8.0  # a one-sided fault must explain this multiple of the squares that remain; friction and weight reach 6
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as moved to another place
@@ -50,7 +50,7 @@ _TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser co
 class EncoderNoise:
     """The noise of every encoder at rest, while no force acts.
 
-    It is the least range of counts over windows of 100 ms. So a person may move the handle if it rests for one window.
+    It is the least range of counts over windows of 100 ms, so a person may move the handle before or after a window.
     """
 
     def __init__(self, axes: int, T: float) -> None:
@@ -161,7 +161,7 @@ class Expected:
             scenes = [build(devices, [Human((Link(i * w, 0.0, 0.0),)) for w in weights]) for i in (0, 1)]
         plants = [hold(scene.plant, scenario.T) for scene in scenes]
         (own, heavy), n = ([-p.B[:, s.outside :] for p, s in zip(plants, scenes, strict=True)]), len(plants[0].A)
-        # one state for three plants: free or held, in heavy hands if free, and the first again under absolute forces
+        # The state has three plants: free or held; in heavy hands if free; the first again, under absolute forces.
         self._A = scipy.linalg.block_diag(plants[0].A, plants[1].A, plants[0].A)
         self._B = np.vstack([own, heavy, 0 * own]), np.vstack([0 * own, 0 * heavy, own])
         self._places = np.array([0, n, n + len(heavy)])
@@ -174,8 +174,8 @@ class Expected:
     def advance(self, axis: int, force: float) -> Array:
         """Apply the force [N] of the motor of `axis` for a tick, and return three positions [m] of this axis.
 
-        They are the expected position, that in a hand as heavy as the device (if the handles are free), and that under
-        the absolute value of all forces so far.
+        The first is the expected position. The second is in a hand as heavy as the device, if the handles are free. The
+        third is under the absolute values of all forces so far.
         """
         signed, absolute = self._B
         self._state = self._A @ self._state + signed[:, axis] * force + absolute[:, axis] * abs(force)
@@ -187,7 +187,7 @@ class _Fit(NamedTuple):
 
     shares: Array  # (k,) coefficients of the shapes
     doubts: Array  # (k,) errors of the coefficients: sqrt(12) standard errors, which 0.05 % of normal errors exceed
-    explains: bool  # whether the last shape explains most of the motion that the other shapes do not explain
+    explains: bool  # whether the last shape explains _BETTER times the squares in `rest`, less their noise
     rest: float  # [m^2] sum of squares that remains
     fitted: Array  # (n,) [m]
 
@@ -238,13 +238,13 @@ class _Block:
         """Fit three sets of shapes to the motion of the tested axis.
 
         The first set has the expected motion, its rate and the motion under absolute forces; it gives the delay. With
-        dry friction the delay would have 6 times its error, because both shift the phase. The other sets have the first
-        two shapes, the motion under a friction of 1 N, and that of a motor that is weak in one direction (the motion
-        under absolute forces), or of an encoder that loses counts in one direction (the length of the path).
+        a shape for dry friction the delay would be 6 times less certain, because both shift the phase. The other sets
+        have the first two shapes, the motion under a friction of 1 N, and that of a one-sided fault: of a motor (the
+        motion under absolute forces), or of an encoder that loses counts in one direction (the length of the path).
         """
         delay = _Fit.of(*self._motion, *self._shapes, self._even)
         fits = [delay]
-        for _ in range(2):  # the second round has friction and path of the motion that the first round fits
+        for _ in range(2):  # Friction and path of the second round follow the motion that the first round has fitted.
             speed = np.gradient(min(fits, key=lambda one: one.rest).fitted + self._slow, self._t)
             rub = self._fast(np.tanh(speed / self._slip).cumsum().cumsum() / -self._inertia)
             extras = self._even, self._fast(np.abs(speed).cumsum())
@@ -269,12 +269,11 @@ class EncoderTest:
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
-    in rehearsals (`held`). A verdict then needs two blocks in a row that agree, and blocks are repeated until the
-    person lets go, at most for 5 s. A small or late motion counts as wrong only where it has the shape of a free handle
+    in rehearsals (`held`). With unknown hands, two blocks in a row must agree, and blocks are repeated until the person
+    lets go, at most for 5 s. A small or late motion counts as wrong only where it has the shape of a free handle
     and not that of a handle in a hand as heavy as the device. The mode of a transmission makes these shapes differ; a
     rigid device has equal shapes. If an axis never moves as a free handle does, the session does not finish. Where it
-    swings at the frequency of the force, at any phase, the message names a hand, too, because an axis with a dead motor
-    does not swing.
+    swings at the frequency of the force, at any phase, the message asks to let go: a dead motor would not swing it.
     """
 
     def __init__(
@@ -312,7 +311,7 @@ class EncoderTest:
         self._pushed = 0.0  # [N] largest force on the axis in this block
         self._finding: str | None = None  # the verdict of the last block
         self._swings = False  # whether the axis swung at the frequency of the force in a block
-        self._weaker = math.nan  # relative size of the last block's motion less its friction; nan if this is not clear
+        self._weaker = math.nan  # upper bound of the last block's relative size without friction; nan if uncertain
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.

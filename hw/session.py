@@ -28,8 +28,7 @@ _ARMING_US = 600_000  # time per axis in which the device must arm and its encod
 _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimited during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
-STRONGEST = 12.0  # [N] largest force at the hand, whatever a scenario allows
-
+STRONGEST = 12.0  # [N] largest force of a device at the hand, whatever a scenario allows
 
 Said = tuple[wire.Force | wire.Stop, ...]  # messages to the device
 
@@ -72,7 +71,8 @@ class Session:
         self._noise: EncoderNoise | None = None
         self._axes: AxisCheck | None = None
         self._shutdown: _Shutdown | None = None
-        self._after: Stage | None = Stage.FINISHED  # stage after a ramp-out; None: disarmed with a softer coupling
+        #: stage after a ramp-out: FINISHED while there is no fault, None to disarm and take a softer coupling
+        self._after: Stage | None = Stage.FINISHED
 
     @property
     def gain(self) -> float:
@@ -411,7 +411,8 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = STRONGEST, **more: Any) -> Session:
     """Return a session in which no device's force at the hand exceeds `cap` [N].
 
-    Where the axes of a device are limited one by one, each of its n axes gets `cap` / sqrt(n).
+    Where the axes of a device are limited one by one, each of its n axes gets `cap` / sqrt(n). `more` are other fields
+    of SafetyLimits.
 
     Raises:
         InputError: A limit or T is impossible, or a rotary scenario has no radius.
@@ -423,7 +424,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = STRONGE
     r, vectors = scenario.lever, tuple((ball.start, ball.stop) for ball in balls)
     scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": SafetyLimits.speed / r, "lever": r} | more
     counts = [len(device.free) for device in scenario.device]
-    axes = np.repeat(counts, counts)  # (m,) axes of the channel's device that are limited one by one
+    axes = np.repeat(counts, counts)  # (m,) number of axes of the channel's device; 1 if its vector is limited
     for first, end in vectors:
         axes[first:end] = 1
     caps = tuple(min(cap * r / n**0.5, limit) for n, limit in zip(axes.tolist(), limits, strict=True))

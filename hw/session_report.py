@@ -162,7 +162,7 @@ class _WorldSession(WorldRecord):
 
 @dataclass(frozen=True)
 class SessionReport:
-    """The report of a session: its coupling with certificates, its log and its link. It has no verdict."""
+    """The report of a session: its coupling with certificates, its log and its link."""
 
     case: str
     scenario: str
