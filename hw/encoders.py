@@ -344,6 +344,12 @@ class EncoderTest:
         """Return what the person must do so that the axis can pass its test, or None."""
         return f"let go of the handle of axis {self._axis + 1}" if self._block > _BLOCKS else None
 
+    @property
+    def _or_undeclared(self) -> str:
+        """Return a further reason for a late or wrong motion of a compliant device, or ""."""
+        compliant = math.isfinite(self._expected.mode[self._axis])
+        return " (or its transmission or mass is not as declared)" * compliant
+
     def _passed(self) -> bool:
         """Return whether the axis has passed its test. Raises SafetyStop where it answered wrongly.
 
@@ -405,7 +411,8 @@ class EncoderTest:
         if weak and (doubt >= _LATE or abs(late - most_late) < doubt):
             return None  # a larger motion shows the delay better
         if late_for_sure:
-            return f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
+            what = "an encoder or motor has a hidden delay"
+            return f"{name} answers {late:.1f} ticks later than agreed: {what}{self._or_undeclared}"
         if doubt >= _LATE:
             coarse = f"counts of {1e3 * self._units.encoder_step[axis]:.3g} mm show it to {doubt:.1f} ticks only"
             self.remarks.append(f"a hidden delay of {name} is not tested: {coarse}")
@@ -432,7 +439,7 @@ class EncoderTest:
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._answer.span[self._axis]) > self._still[self._axis]:
-            return f"axis {axis} does not follow {at} as a free handle does: let go of it while arming"
+            return f"axis {axis} does not follow {at} as a free handle: let go of it while arming{self._or_undeclared}"
         return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"
 
 

@@ -80,6 +80,17 @@ def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     assert 0 < np.abs(forces).max() <= most
 
 
+@pytest.mark.parametrize("share", [1.1, 1.5])
+def test_small_declared_masses_are_blamed(scenario, rungs, share):
+    """A heavier compliant device swings more slowly than expected, which looks like a hidden delay or a hand."""
+    free = nobody(scenario)
+    heavy = [replace(d, motor_mass=share * d.motor_mass, handle_mass=share * d.handle_mass) for d in free.device]
+    session = Session(free, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=False))
+    Rehearsal(session, Emulator(free.replace(device=tuple(heavy))), lambda ages: rungs).run_until_armed(1.0)
+    assert session.stage == Stage.STOPPED
+    assert "mass is not as declared" in session.cause
+
+
 def played(test, motion, ticks=6000):
     """Run a test on encoders that read `motion`(k, steps applied so far); return its forces (ticks, m) [N]."""
     forces, applied = [], np.zeros((ticks, 2), int)
