@@ -40,6 +40,13 @@ _HUGE = 1e12  # [N] A force of this size or more counts as an error and is sent 
 _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 
+def check_start(name: str, start: float) -> float:
+    """Return W0 [J]. Raises ValueError, which begins with `name`, unless W0 is finite and >= 0."""
+    if not 0 <= start < np.inf:
+        raise ValueError(f"{name} is {start:g} J, expected a finite energy >= 0")
+    return start
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetFigures:
     """Counts of the ticks of a run, and of those in which a passivity layer changed the force."""
@@ -91,8 +98,7 @@ class _Net(_Acting):
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
         super().__init__(nsim)
-        if not 0 <= start < np.inf:
-            raise ValueError(f"the budget starts with {start:g} J, expected a finite energy >= 0")
+        check_start("W0", start)
         if not start <= cap:
             raise ValueError(f"the budget's cap is {cap:g} J, expected at least its start, {start:g} J")
         self.energy = np.full(nsim, float(start))  # (nsim,) W [J]

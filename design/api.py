@@ -182,7 +182,8 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: Coupling and loop have different numbers of channels, or the environment never exerts a force.
+        ValueError: Coupling and loop have different numbers of channels, the environment never exerts a force, or
+            `band_hz` is no band.
     """
     of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(fitting(loop, coupling)), loop.E(), loop.lam, band_hz)

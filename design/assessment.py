@@ -10,20 +10,20 @@ run. If one of them changes, `assess` must be called again.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from haptic_loop.controller.arithmetic import SingularLoop, one_blas_thread
-from haptic_loop.controller.budget import START_J
+from haptic_loop.controller.budget import START_J, check_start
 from haptic_loop.controller.coupling import Coupling, require_channels
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member, inside, number_of_vertices, where_proved
-from haptic_loop.design.arguments import of_kind
+from haptic_loop.design.arguments import number, of_kind, whole
 from haptic_loop.design.certificate import (
     condition_of,
     is_ours,
@@ -49,6 +49,7 @@ from haptic_loop.design.environments import (
     in_each,
     worst,
 )
+from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice, described
 from haptic_loop.design.result import (
@@ -62,7 +63,7 @@ from haptic_loop.design.result import (
     held_torques,
     suffices,
 )
-from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
+from haptic_loop.design.transparency import BAND_HZ, Transparency, in_band, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
 #: A user's function u -> force (m,) [N]. u (m,) [m] are the environment's displacements without this tick's force.
@@ -283,19 +284,19 @@ class ForceLimits:
     def words(self) -> str:
         """The limits and what covers them, in one line for a report."""
         amounts = [f"{f:.4g}" for f in self.force_limit]
-        limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
-        how = "clipped" if self.rho is None else "limited"
+        figures = f" to {', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N" if amounts else ""
+        how = f"{'clipped' if self.rho is None else 'limited'}{figures}"
         if self.void:
             scaled = "" if self.energy_budget is None else " and scaled by an energy account"
-            return f"{how} to {limit}{scaled}, without a guarantee"
+            return f"{how}{scaled}, without a guarantee"
         if self.energy_budget is not None:
-            return f"{how} to {limit}, and scaled by an energy account of {self.energy_budget:g} J"
+            return f"{how}, and scaled by an energy account of {self.energy_budget:g} J"
         if self.rho is None:
             why = self.reason.removeprefix("limiter: ")
-            return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
+            return f"{how}: a guarantee holds while forces stay below their limits ({why})"
         if not self.proved:
-            return f"certified, also while forces are limited to {limit} ({self.reason})"
-        return f"proved, also while forces are limited to {limit}{', in this environment' if self.less else ''}"
+            return f"certified, also while forces are {how} ({self.reason})"
+        return f"proved, also while forces are {how}{', in this environment' if self.less else ''}"
 
     @property
     def proved(self) -> bool:
@@ -671,10 +672,21 @@ def assess(
         commands qualify the assessment by the scenario's encoder steps and lost packets.
 
     Raises:
-        TypeError: `loop` is no Loop, or `coupling` no coupling.
-        ValueError: The numbers of channels of coupling and loop differ, or the condition is unknown.
+        TypeError: An argument has the wrong type.
+        ValueError: The numbers of channels of coupling and loop differ, the condition is unknown, or a number is out of
+            range.
     """
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
+    if environment is not None and not callable(environment):
+        of_kind("environment", environment, Environment, "a Network, your own Environment or a function")
+    if energy_budget is not None:
+        energy_budget = check_start("energy_budget", number("energy_budget", energy_budget, "an energy in J"))
+    for name, proof in (("certificate", certificate), ("limiter_proof", limiter_proof)):
+        if proof is not None:
+            of_kind(name, proof, Certificate, "a Certificate, as prove(loop, coupling, condition) gives it")
+    ranges_seed, ranges_samples = whole("ranges_seed", ranges_seed, 0), whole("ranges_samples", ranges_samples, 0)
+    force_limit = _checked_limits(force_limit, loop.channels)
+    in_band(band_hz, loop.T)
     if isinstance(coupling, Design):
         certificate, condition = certificate or coupling.certificate, condition or coupling.required_condition
         proof = coupling.certificate  # The design's search is for this loop only if its proof is.
@@ -739,6 +751,16 @@ def assess(
     if guarantee is None:
         return assessment.without_guarantee(str(reason))
     return replace(assessment, guarantee=guarantee)
+
+
+def _checked_limits(force_limit: Sequence[float], channels: int) -> tuple[float, ...]:
+    """Return limits (m,) [N], or () for none. Raises TypeError or InputError for other values."""
+    expected = f"a positive force in N for each of {channels} channels, or ()"
+    of_kind("force_limit", force_limit, Iterable, expected)
+    limits = tuple(number("force_limit", limit, expected) for limit in force_limit)
+    if len(limits) not in (0, channels) or not all(limit > 0 for limit in limits):
+        raise InputError(f"force_limit is {list(limits)}, expected {expected}")
+    return limits
 
 
 def _force_limits(

@@ -42,7 +42,7 @@ from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
-from haptic_loop.design.transparency import BAND_HZ, decibels
+from haptic_loop.design.transparency import BAND_HZ, decibels, in_band
 
 _GRID = 250  # points of the grid with equal steps, and as many with equal ratios; H is linear between grid points
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h, even in log frequency
@@ -121,7 +121,7 @@ class _Dual:
     @classmethod
     def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
         E = loop.E()
-        low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)
+        low, high = in_band(band_hz, loop.T)
         span, end = np.log(high / low), min(high, 0.999 * np.pi)  # H is zero above `end`.
         knots = _knots(E, low, end, count)
         grid = np.union1d(knots, frequencies(E, low=low, high=end, points=_GRID))

@@ -16,6 +16,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop, forget_exact
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import budgets
+from haptic_loop.design.arguments import of_kind
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
     Certificate,
@@ -441,6 +442,7 @@ def is_ours(condition: Condition) -> bool:
 def named(condition: str | Condition) -> Condition:
     """Return the condition with this name, or the condition itself. Raises ValueError for an unknown or taken name."""
     if not isinstance(condition, str):
+        of_kind("condition", condition, Condition, f"{', '.join(_NAMED)} or your own Condition")
         name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in reserved
         if not (free or is_ours(condition)):

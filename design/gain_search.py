@@ -30,7 +30,7 @@ from haptic_loop.design.frequency import frequencies, hermitian, least_eigenpair
 from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
-from haptic_loop.design.transparency import BAND_HZ, rms_mismatch
+from haptic_loop.design.transparency import BAND_HZ, in_band, rms_mismatch
 
 #: share of the damping that the condition at sampled frequencies leaves unused, for violations between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
@@ -69,11 +69,10 @@ class SampledLoop:
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.loop, self.E = loop, loop.E()
-        per_hz = 2 * np.pi * loop.T
-        low, high = (per_hz * f for f in band_hz)
+        low, high = in_band(band_hz, loop.T)
         self.delta = even_damping(loop)
         self.root = np.sqrt(loop.T / self.delta)
-        self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
+        self.band = frequencies(self.E, low=low, high=high, points=80)
         E = Sampled.of(self.E, on_circle(self.band)[None])
         one = Sampled(E.z, np.broadcast_to(np.eye(loop.channels, dtype=complex), E.G.shape), E.T)
         self.late = np.diagonal(loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]  # Theta

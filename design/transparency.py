@@ -12,10 +12,23 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design.arguments import number, of_kind
+from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)  # [Hz] default band of the mismatch
+_LATEST = 0.45  # [1/T] A band that begins above this frequency is too narrow for the grids of sweeps and of the bound.
 _ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
+
+
+def in_band(band_hz: Sequence[float], T: float) -> tuple[float, float]:
+    """Return the ends of a band [Hz] in rad/sample, at most pi. Raises TypeError or InputError for no band."""
+    expected = f"two rising frequencies in Hz, the first above 0 and below {_LATEST / T:.6g}"
+    of_kind("band_hz", band_hz, Sequence, expected)
+    band = [2 * np.pi * T * number("band_hz", frequency, expected) for frequency in band_hz]
+    if len(band) != 2 or not 0 < band[0] < min(band[1], 2 * np.pi * _LATEST):
+        raise InputError(f"band_hz is {list(band_hz)}, expected {expected}")
+    return band[0], min(band[1], np.pi)
 
 
 @dataclass(frozen=True)
@@ -85,8 +98,7 @@ def _reference(environment: Lti, lam: Sequence[int], band_hz: tuple[float, float
     """Return Lambda E and the ends of the band [rad/sample]. Raises ValueError if E is zero."""
     if silent(environment):
         raise ValueError(NO_FORCE)
-    per_hz = 2 * np.pi * environment.T
-    return delay(lam, environment.T) @ environment, band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
+    return delay(lam, environment.T) @ environment, *in_band(band_hz, environment.T)
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:

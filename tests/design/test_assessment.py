@@ -125,6 +125,41 @@ def test_words_say_whether_limited_forces_are_covered():
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
 
 
+def test_words_without_limits_name_no_figure():
+    covered, clipped = on_its_own_loop().force_limits, assess(LOOP, HERE_ONLY, limiter=False).force_limits
+    assert covered.words == covered.part()["words"] == "proved, also while forces are limited"
+    assert clipped.words.startswith("clipped: a guarantee holds while forces stay below their limits")
+    accounts = [assess(LOOP, HERE_ONLY, energy_budget=0.1, limiter=limiter).force_limits for limiter in (None, False)]
+    assert [limits.words.split(",")[0] for limits in accounts] == ["limited", "clipped"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"energy_budget": -1}, "energy_budget is -1 J, expected a finite energy"),
+        ({"energy_budget": float("nan")}, "energy_budget is nan J"),
+        ({"energy_budget": "lots"}, "energy_budget is 'lots' (str)"),
+        ({"force_limit": (1.0, 2.0)}, "force_limit is [1.0, 2.0], expected a positive force"),
+        ({"force_limit": (-1.0,)}, "force_limit is [-1.0]"),
+        ({"force_limit": 3}, "force_limit is 3 (int)"),
+        ({"force_limit": "x"}, "force_limit is 'x' (str)"),
+        ({"ranges_seed": -1}, "ranges_seed is -1, allowed are 0 or more"),
+        ({"ranges_samples": 0.5}, "ranges_samples is 0.5 (float)"),
+        ({"environment": 3}, "environment is 3 (int), expected"),
+        ({"certificate": 3}, "certificate is 3 (int), expected"),
+        ({"limiter_proof": 3}, "limiter_proof is 3 (int), expected"),
+        ({"condition": 3}, "condition is 3 (int), expected"),
+        ({"band_hz": (3, 1)}, "band_hz is [3, 1], expected two rising frequencies in Hz"),
+        ({"band_hz": (5000, 6000)}, "band_hz is [5000, 6000]"),
+        ({"band_hz": 3}, "band_hz is 3 (int)"),
+    ],
+)
+def test_impossible_arguments_are_named(arguments, message):
+    with pytest.raises((TypeError, ValueError)) as refused:
+        assess(LOOP, HERE_ONLY, **arguments)
+    assert message in str(refused.value)
+
+
 def test_a_users_condition_must_name_switching_delays():
     """A condition whose `covers` does not name switching delays is refused, and the rho that it gives is not used."""
 
