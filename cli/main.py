@@ -1,4 +1,4 @@
-"""Run the commands: as haptic-loop COMMAND, and as python -m sim.run and other modules, which call `door`.
+"""Run the commands: as haptic-loop COMMAND, and as python -m sim.run and other modules, which call `run_command`.
 
 This module imports nothing that takes time, so that the process that draws the picture (cli.painter) starts at once.
 """
@@ -36,7 +36,7 @@ COMMANDS = {
 _LEADING = 5  # number of commands that --help shows first
 
 
-def door(command: str) -> NoReturn:
+def run_command(command: str) -> NoReturn:
     """Run a command with the arguments of the command line."""
     _run(command, sys.argv[1:])
 

@@ -1,6 +1,6 @@
 """python -m design: design a coupling, prove it, store it; the command is cli/design.py."""
 
 if __name__ == "__main__":
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("design")
+    run_command("design")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("export")
+    run_command("export")
 
 import textwrap
 from collections.abc import Iterable, Sequence

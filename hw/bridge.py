@@ -1,6 +1,6 @@
 """python -m hw.bridge: run a session with a device; the command is cli/bridge.py."""
 
 if __name__ == "__main__":
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("bridge")
+    run_command("bridge")

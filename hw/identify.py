@@ -10,9 +10,9 @@ dry friction.
 from __future__ import annotations
 
 if __name__ == "__main__":  # before the imports, which --help does not need
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("identify")
+    run_command("identify")
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,6 +1,6 @@
 """python -m hw.replay: feed a recorded session through the controller again; the command is cli/replay.py."""
 
 if __name__ == "__main__":
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("replay")
+    run_command("replay")

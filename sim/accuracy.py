@@ -7,9 +7,9 @@ settings on a scene, and `pick` chooses the cheapest one within a given error.
 from __future__ import annotations
 
 if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("accuracy")
+    run_command("accuracy")
 
 import math
 import time

@@ -9,9 +9,9 @@ controller.tick for the order of these steps, and sim.engines for the last step.
 from __future__ import annotations
 
 if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("run")
+    run_command("run")
 
 import shutil
 import tempfile

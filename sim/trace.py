@@ -15,9 +15,9 @@ growth        How fast does an oscillation grow? If it grows like exp(g t), the 
 from __future__ import annotations
 
 if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("trace")
+    run_command("trace")
 
 import json
 from collections.abc import Mapping, Sequence

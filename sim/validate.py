@@ -1,6 +1,6 @@
 """python -m sim.validate: thousands of random hands on the loop (sim.crowds); the command is cli/validate.py."""
 
 if __name__ == "__main__":
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("validate")
+    run_command("validate")

@@ -9,9 +9,9 @@ few cells it runs MuJoCo with the encoder steps, friction and walls of the scena
 from __future__ import annotations
 
 if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("zwidth")
+    run_command("zwidth")
 
 import os
 import time

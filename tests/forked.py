@@ -178,7 +178,7 @@ def _request_fork(words: list[str], folder: Path, files: list[Path], environment
 
 def _command(words: list[str]) -> None:
     """Run the command or the file in the child. A command raises SystemExit."""
-    from haptic_loop.cli.main import COMMANDS, door
+    from haptic_loop.cli.main import COMMANDS, run_command
 
     if words[0] != "-m":
         sys.argv = words
@@ -186,7 +186,7 @@ def _command(words: list[str]) -> None:
         return
     sys.argv = words[1:]
     if command := {module: command for command, (module, _) in COMMANDS.items()}.get(words[1]):
-        door(command)
+        run_command(command)
     runpy.run_module(words[1], run_name="__main__")
 
 

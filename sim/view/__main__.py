@@ -1,6 +1,6 @@
 """python -m sim.view: the live window."""
 
 if __name__ == "__main__":
-    from haptic_loop.cli.main import door
+    from haptic_loop.cli.main import run_command
 
-    door("view")
+    run_command("view")

@@ -15,7 +15,7 @@ from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
 
 ROOT = Path(__file__).parents[2]
-DOOR = re.compile(r"    door\(\"(\w+)\"\)")  # the line with which a file starts a command of cli
+ENTRY = re.compile(r"    run_command\(\"(\w+)\"\)")  # the line with which a file starts a command of cli
 LAUNCH = re.compile(r"    execute\((\w+)\)")  # the line with which a file starts a command that it defines
 
 
@@ -27,15 +27,15 @@ def modules():
     """Return the modules of all commands, as python -m names them."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
     texts = {path: path.read_text() for path in files}
-    doors = [path for path in files if DOOR.search(texts[path]) or LAUNCH.search(texts[path])]
-    parts = [path.relative_to(ROOT).with_suffix("").parts for path in doors]
+    entries = [path for path in files if ENTRY.search(texts[path]) or LAUNCH.search(texts[path])]
+    parts = [path.relative_to(ROOT).with_suffix("").parts for path in entries]
     return [".".join(names).removesuffix(".__main__") for names in parts]
 
 
 def main_of(module):
     path = ROOT / module.replace(".", "/")
     text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
-    if match := DOOR.search(text):
+    if match := ENTRY.search(text):
         assert COMMANDS[match.group(1)][0] == module
         return importlib.import_module(f"haptic_loop.cli.{match.group(1)}").main
     package = f"{module}.__main__" if path.is_dir() else module

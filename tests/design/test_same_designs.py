@@ -21,8 +21,8 @@ for name in ("monotonic", "perf_counter", "process_time", "thread_time", "time")
     setattr(time, name, lambda clock=getattr(time, name): 1e4 * clock())
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-from haptic_loop.cli.main import door
-door("design")
+from haptic_loop.cli.main import run_command
+run_command("design")
 """
 
 

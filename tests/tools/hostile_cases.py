@@ -172,7 +172,7 @@ def streams() -> Iterator[Case]:
     def backend() -> None:
         os.environ["MPLBACKEND"] = "nonsense"
         script = f"import sys; sys.path.insert(0, {str(Path(options.__file__).parents[1])!r}); "
-        script += "from haptic_loop.cli.main import door; door('trace')"
+        script += "from haptic_loop.cli.main import run_command; run_command('trace')"
         os.execv(sys.executable, [sys.executable, "-c", script, "t.npz", "--plot", "a.png"])
 
     yield Case("MPLBACKEND=nonsense", ("trace",), (0,), before=backend)
