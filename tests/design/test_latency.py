@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from analysis import solve
 from driven import growing
 from evaluate import latency_demand, this_environment, this_environment_demand
 from scipy.linalg import expm
@@ -115,7 +116,7 @@ def by_a_dense_program(loop, coupling, latencies):
         real = np.block([[H.real, -H.imag], [H.imag, H.real]])
         limits.append(T * (cp.kron(np.eye(2), taken) + real) / loop.delta[0] >> 0)
     assert m == 2
-    return cp.Problem(cp.Minimize(s / loop.delta[0]), limits).solve(solver=cp.CLARABEL) * loop.delta[0]
+    return solve(cp.Problem(cp.Minimize(s / loop.delta[0]), limits)) * loop.delta[0]
 
 
 @pytest.mark.slow
