@@ -23,6 +23,7 @@ from haptic_loop.hw.protocol import Info
 from haptic_loop.hw.rehearsal import Plan, Rehearsal
 from haptic_loop.hw.session import Said, Session
 from haptic_loop.sim.scenario import Scenario, load
+from tests.causes import cause_of
 from tests.sessions import MovesAxes, strike
 
 _WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
@@ -47,7 +48,7 @@ class Fault:
 
     name: str
     stage: Stage
-    cause: str = ""  # a regular expression
+    cause: str = ""  # a regular expression for `cause_of` the session's cause
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from _WHEN to zero force; None: not measured
     action: _Call | None = None  # the action of a person or of a faulty controller
@@ -131,21 +132,21 @@ CASES = (
     Fault("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
     Fault("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
     # severe faults of the line
-    Fault("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
-    Fault("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
-    Fault("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
-    Fault("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), _SILENCE),
-    Fault("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), _WATCHDOG),
-    Fault("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), _WATCHDOG),
-    Fault("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), _SILENCE),
-    Fault("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), _WATCHDOG),
-    Fault("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
-    Fault("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), _WATCHDOG + 4.0),
-    Fault("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=_WATCHDOG, host_stall=0.02),
+    Fault("no STATE arrives", G.LOST, "silence:", at("up:drop=1"), _SILENCE),
+    Fault("no FORCE arrives", G.STOPPED, "watchdog:", at("down:drop=1"), _WATCHDOG),
+    Fault("nothing arrives", G.LOST, "silence:", at("drop=1"), _WATCHDOG),
+    Fault("every STATE damaged", G.LOST, "silence:", at("up:flip=1"), _SILENCE),
+    Fault("every FORCE damaged", G.STOPPED, "watchdog:", at("down:flip=1"), _WATCHDOG),
+    Fault("every frame cut short", G.LOST, "silence:", at("truncate=1"), _WATCHDOG),
+    Fault("noise all the time", G.LOST, "silence:", at("up:garbage=60"), _SILENCE),
+    Fault("noise at the device", G.STOPPED, "watchdog:", at("down:garbage=60"), _WATCHDOG),
+    Fault("40 % of FORCEs lost", G.STOPPED, "missed answers:|watchdog:", at("down:drop=0.4"), 300.0),
+    Fault("2 ms later both ways", G.STOPPED, "watchdog:", at("delay=0.002"), _WATCHDOG + 4.0),
+    Fault("host freezes for 20 ms", G.STOPPED, "watchdog:", within=_WATCHDOG, host_stall=0.02),
     Fault("cable pulled", G.LOST, "port is gone", at("unplug"), _WATCHDOG),
     # the delay
     Fault("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.4),
-    Fault("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.4),
+    Fault("late, nothing softer", G.STOPPED, "late answers:", _LATE, 500.0, counted=("late",), lasts=1.4),
     Fault("a slow link from the start", A, faults=("delay=0.004",), designed=True),
     Fault("answers in bursts, every 3 ms", A, faults=("down:burst=0.003",), designed=True),
     Fault("STATEs in bursts, every 3 ms", A, faults=("up:burst=0.003",), designed=True),
@@ -153,116 +154,120 @@ CASES = (
     Fault("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
     Fault("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
     # while the gain rises
-    Fault("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.28",), _AT_ONCE, designed=True),
-    Fault("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.3",), _AT_ONCE),
-    Fault("many FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.28",), _AT_ONCE),
     Fault(
-        "tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.29",), _AT_ONCE
+        "answers late in ramp-in",
+        G.DISARMED,
+        "theta = 2",
+        ("down:jitter=0.0007@0.28",),
+        _AT_ONCE,
+        designed=True,
     ),
+    Fault("no FORCE in ramp-in", G.STOPPED, "watchdog:", ("down:drop=1@0.3",), _AT_ONCE),
+    Fault("many FORCEs lost in ramp-in", G.STOPPED, "missed answers:|watchdog:", ("down:drop=0.4@0.28",), _AT_ONCE),
+    Fault("tick number leaps in ramp-in", G.STOPPED, "tick leap: 301 5", ("leap=300@0.29",), _AT_ONCE),
     # the measurement
-    Fault("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
-    Fault("3 % lost from the start", G.REFUSED, "no delay covers 99 %", ("down:drop=0.03",), designed=True),
+    Fault("a third of FORCEs lost from the start", G.REFUSED, "answers that never reached:", ("down:drop=0.33",)),
+    Fault(
+        "3 % lost from the start", G.REFUSED, "answers that never arrived: .* 99$", ("down:drop=0.03",), designed=True
+    ),
     # the device
-    Fault("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
-    Fault("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
+    Fault("tick number leaps by 300", G.STOPPED, "tick leap: 301", at("leap=300"), _STOP),
+    Fault("tick number leaps by 3", G.STOPPED, "device clock:", at("leap=3"), _STOP),
     *_signed(
         "an uncommanded force of {} N on axis {}",
         "own",
         2,
-        "it was told .*; 5 ticks or more were wrong",
+        "force unlike the command: .* 5$",
         _STOP + 6 * _T_MS,
     ),
-    Fault("an uncommanded force in ramp-in", G.STOPPED, "it was told", ("own=2@0.3",), _AT_ONCE),
-    Fault("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
-    Fault("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
+    Fault("an uncommanded force in ramp-in", G.STOPPED, "force unlike the command:", ("own=2@0.3",), _AT_ONCE),
+    Fault("a tick lasts twice as long", G.STOPPED, "device clock:", at("period=2"), 2 * _STOP + 6 * _T_MS),
+    Fault("clock drifts by 2 %", G.STOPPED, "device clock: 12.. ", at("period=1.02"), 250.0),
     Fault("clock drifts by 0.5 %", A, faults=at("period=1.005")),
-    Fault("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
-    Fault("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
+    Fault("device freezes for 20 ms", G.LOST, "silence:", at("stall=0.02"), 20.0 + _WATCHDOG),
+    Fault("device resets", G.LOST, "silence:", at("reset"), _AT_ONCE),
     Fault("encoder jumps by 0.05 mm", A, faults=at("jump=0.05")),
-    *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
-    *_signed("jump of {} mm, encoder {}", "jump", 0.2, "encoder {axis} jumped by", _STOP + _T_MS),
-    *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} jumped by", _STOP + 2 * _T_MS),
+    *_signed("jump of {} mm, encoder {}", "jump", 5, "(jump|jolt): {axis} ", _STOP),
+    *_signed("jump of {} mm, encoder {}", "jump", 0.2, "(jump|jolt): {axis} ", _STOP + _T_MS),
+    *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "(jump|jolt): {axis} ", _STOP + 2 * _T_MS),
     *(
-        Fault(
-            f"encoder {axis} {what}", G.STOPPED, f"encoder {axis} jumped by", (f"axis{axis}:{fault}@0.48",), lasts=2.2
-        )
+        Fault(f"encoder {axis} {what}", G.STOPPED, f"(jump|jolt): {axis} ", (f"axis{axis}:{fault}@0.48",), lasts=2.2)
         for axis in (1, 2)
         for what, fault in (("wraps every 2 mm", "wrap=2"), ("has a stuck bit of 0.26 mm", "bit=8"))
     ),
-    *_signed(
-        "{} m/s, below the limit, handle {}", "drift", 0.69, "axis {axis} moves at 0.7|encoder {axis} is at", None
-    ),
-    *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at", _STOP + 12 * _T_MS),
-    *_signed(
-        "{} mm, out of the range of encoder {}", "jump", 200, r"encoder {axis} is at {sign}\d.*its range is", None, ""
-    ),
-    Fault("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
-    Fault("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _STOP),
-    Fault("one channel of encoder 1 dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
-    Fault("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _STOP),
-    Fault("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
-    Fault("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
-    Fault("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.7),
-    Fault("a channel of encoder 1 dies", G.STOPPED, "axis 1 does not follow", at("toggle"), _DEAD),
-    Fault("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
+    *_signed("{} m/s, below the limit, handle {}", "drift", 0.69, "speed: {axis} 0.7|range: {axis} ", None),
+    *_signed("{} m/s, handle {}", "drift", 1.5, "speed: {axis} ", _STOP + 12 * _T_MS),
+    *_signed("{} mm, out of the range of encoder {}", "jump", 200, r"range: {axis} {sign}\d", None, ""),
+    Fault("encoder dead before", G.STOPPED, "dead encoder: 1 0 ", ("freeze",), _AT_ONCE),
+    Fault("encoder 2 dead before", G.STOPPED, "dead encoder: 2 0 ", ("axis2:freeze",), _STOP),
+    Fault("one channel of encoder 1 dead before", G.STOPPED, "(dead|still) encoder: 1 ", ("toggle",), _AT_ONCE),
+    Fault("a channel of encoder 2 dead before", G.STOPPED, "(dead|still) encoder: 2 ", ("axis2:toggle",), _STOP),
+    Fault("encoder dies", G.STOPPED, "(dead|still) encoder: 1 ", at("freeze"), _DEAD),
+    Fault("encoder 2 dies", G.STOPPED, "(dead|still) encoder: 2 ", at("axis2:freeze"), _DEAD),
+    Fault("both encoders die", G.STOPPED, "still encoder:", at("freeze axis2:freeze"), _DEAD, lasts=1.7),
+    Fault("a channel of encoder 1 dies", G.STOPPED, "(dead|still) encoder: 1 ", at("toggle"), _DEAD),
+    Fault("a channel of encoder 2 dies", G.STOPPED, "(dead|still) encoder: 2 ", at("axis2:toggle"), _DEAD),
     *_signed(
         "saturated at {} mm, encoder {}",
         "saturate",
         4,
-        "axis {axis} does not follow",
+        "still encoder: {axis} ",
         None,
         "@0.48",
         lasts=2.2,
     ),
     # faults that the test at arming must find
     *(
-        Fault(f"{what} of axis {axis} before", G.STOPPED, f"{axis} {cause}", (f"axis{axis}:{fault}",), _AT_ONCE)
+        Fault(f"{what} of axis {axis} before", G.STOPPED, cause.format(axis), (f"axis{axis}:{fault}",), _AT_ONCE)
         for axis in (1, 2)
         for what, fault, cause in (
-            ("reversed encoder", "reverse", "has the wrong sign"),
-            ("reversed motor", "motor=-1", "has the wrong sign"),
-            ("encoder scale 2.5", "scale=2.5", "moves 2.5 times as far"),
-            ("encoder scale 0.4", "scale=0.4", r"moves 0\.(4|39) times as far"),
-            ("dead motor", "motor=0", "does not follow"),
+            ("reversed encoder", "reverse", "wrong sign: {}"),
+            ("reversed motor", "motor=-1", "wrong sign: {}"),
+            ("encoder scale 2.5", "scale=2.5", "wrong scale: {} 2.5 "),
+            ("encoder scale 0.4", "scale=0.4", r"wrong scale: {} 0\.(4|39) "),
+            ("dead motor", "motor=0", "(dead encoder|held at arming): {} "),
         )
     ),
     *(
         Fault(f"{what} of axis {axis}, a hand moves before", G.STOPPED, cause, (f"axis{axis}:{fault}", drift), _AT_ONCE)
         for axis in (1, 2)
         for drift in (f"axis{axis}:drift=0.05@0",)
-        for what, fault, cause in (("reversed encoder", "reverse", "wrong sign"), ("dead motor", "motor=0", "follow"))
+        for what, fault, cause in (
+            ("reversed encoder", "reverse", "wrong sign:"),
+            ("dead motor", "motor=0", "dead encoder:|held at arming:"),
+        )
     ),
     # faults that the test at the end must find
     *(
         Fault(f"{what} of axis {axis} dies, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}@0.6",), **_ENDED)
         for axis in (1, 2)
         for what, fault, cause in (
-            ("motor", "motor=0", "did not answer"),
-            ("sign", "motor=-1", "sign|speed|moves|follow|clipped|did not"),
+            ("motor", "motor=0", "no answer at the end:"),
+            ("sign", "motor=-1", "wrong sign:|speed:|(dead|still) encoder:|no answer at the end:|clipped"),
         )
     ),
     *(
         Fault(f"{what} of axis {axis}, free, then the end", G.STOPPED, cause, (fault,), free=True, **_ENDED)
         for axis in (1, 2)
         for what, kind in (("encoder scale 0.4", "scale"), ("motor 0.4 times as strong", "motor"))
-        for fault, cause in ((f"axis{axis}:{kind}=0.4@0.6", f"axis {axis} moves 0.4.* times as far"),)
+        for fault, cause in ((f"axis{axis}:{kind}=0.4@0.6", f"(wrong scale|weaker motor): {axis} 0.4"),)
     ),
     *(
         Fault(f"motor {axis} {what}, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}",), free=True, **_ENDED)
         for axis in (1, 2)
         for what, fault, cause in (
-            ("saturates at 0.6 N before", "limit=0.6", f"axis {axis} moves 0.* times as far"),
-            ("saturates at 0.6 N", "limit=0.6@0.6", f"axis {axis} moves 0.* times as far"),
-            ("is 0.6 times as strong", "motor=0.6@0.6", f"axis {axis} moves 0.6.* times as far as at arming"),
-            ("makes 0.15 of negative forces", "oneway=0.15@0.6", f"axis {axis} moves .*than in the other"),
-            ("makes half of negative forces", "oneway=0.5@0.6", f"axis {axis} moves .*than in the other.*weak in one"),
+            ("saturates at 0.6 N before", "limit=0.6", f"(wrong scale|weaker motor): {axis} 0."),
+            ("saturates at 0.6 N", "limit=0.6@0.6", f"(wrong scale|weaker motor): {axis} 0."),
+            ("is 0.6 times as strong", "motor=0.6@0.6", f"weaker motor: {axis} 0.6"),
+            ("makes 0.15 of negative forces", "oneway=0.15@0.6", f"one-sided (motor|encoder): {axis}"),
+            ("makes half of negative forces", "oneway=0.5@0.6", f"one-sided motor: {axis}"),
         )
     ),
     *(
         Fault(
             f"motor {axis} makes {share} of negative forces before{', free' * free}",
             G.STOPPED,
-            f"axis {axis} moves .*than in the other",
+            f"one-sided (motor|encoder): {axis}",
             (f"axis{axis}:oneway={share}",),
             _AT_ONCE,
             free=free,
@@ -274,17 +279,17 @@ CASES = (
         Fault(f"{what} of axis {axis} before, free", G.STOPPED, cause, (f"axis{axis}:{fault}",), _AT_ONCE, free=True)
         for axis in (1, 2)
         for what, fault, cause in (
-            ("half of negative forces", "oneway=0.5", f"axis {axis} moves .*than in the other.*weak in one"),
-            ("dead zone of 0.1 N", "zone=0.1", f"axis {axis} moves 0.* its motor has a dead zone"),
-            ("dead zone of 0.3 N", "zone=0.3", f"axis {axis} moves 0.* its motor has a dead zone"),
-            ("half of negative counts", "lose=0.5", f"axis {axis} moves .*than in the other.*loses counts"),
-            ("negative counts twice", "lose=2", f"axis {axis} moves .*than in the other.*loses counts"),
+            ("half of negative forces", "oneway=0.5", f"one-sided motor: {axis}"),
+            ("dead zone of 0.1 N", "zone=0.1", f"dead zone: {axis} 0."),
+            ("dead zone of 0.3 N", "zone=0.3", f"dead zone: {axis} 0."),
+            ("half of negative counts", "lose=0.5", f"one-sided encoder: {axis}"),
+            ("negative counts twice", "lose=2", f"one-sided encoder: {axis}"),
         )
     ),
     *(
         Fault(f"half of negative counts of axis {axis}, then the end", G.STOPPED, cause, (fault,), free=True, **_ENDED)
         for axis in (1, 2)
-        for fault, cause in ((f"axis{axis}:lose=0.5@0.6", f"axis {axis} moves .*than in the other.*loses counts"),)
+        for fault, cause in ((f"axis{axis}:lose=0.5@0.6", f"one-sided encoder: {axis}"),)
     ),
     # faults that nothing finds (docs/hardware.md)
     *(
@@ -313,45 +318,49 @@ CASES = (
             free=True,
         )
         for axis in (1, 2)
-        for n, cause in ((1, f"axis {axis} answers 1.0 ticks later"), (2, f"axis {axis} answers .* ticks later"))
+        for n, cause in ((1, f"late axis: {axis} 1.0$"), (2, f"late axis: {axis}"))
     ),
     *(
-        Fault(f"motor 2 makes {part} of force 1, too", G.STOPPED, "moves encoder 2, too", (f"cross={part}",), _AT_ONCE)
+        Fault(f"motor 2 makes {part} of force 1, too", G.STOPPED, "connected axes: 1 2", (f"cross={part}",), _AT_ONCE)
         for part in (1.0, 0.5, -1.0)
     ),
     Fault("axes moved by hand", A, free=True, shown=True),
-    Fault(
-        "axes 1 and 2 exchanged", G.REFUSED, "axis 2 moved .* instead of axis 1", ("exchange",), free=True, shown=True
-    ),
+    Fault("axes 1 and 2 exchanged", G.REFUSED, "moved another axis: 2 .* 1$", ("exchange",), free=True, shown=True),
     *(
         Fault(
             f"axis {i} all reversed",
             G.REFUSED,
-            f"axis {i} moved .* not",
+            f"moved backwards: {i} -",
             (f"axis{i}:motor=-1", f"axis{i}:reverse"),
             free=True,
             shown=True,
         )
         for i in (1, 2)
     ),
-    Fault("axes swapped before", G.STOPPED, "force on axis 1 moves encoder 2", ("swap",), _AT_ONCE),
-    Fault("axes swapped and reversed before", G.STOPPED, "encoder 2", ("swap", "reverse", "axis2:reverse"), _AT_ONCE),
+    Fault("axes swapped before", G.STOPPED, "swapped axes: 1 2", ("swap",), _AT_ONCE),
+    Fault(
+        "axes swapped and reversed before",
+        G.STOPPED,
+        "swapped axes: 1 2",
+        ("swap", "reverse", "axis2:reverse"),
+        _AT_ONCE,
+    ),
     *(
         Fault(
             f"{what} of axis {axis} before, free",
             G.STOPPED,
-            f"axis {axis} {cause}",
+            cause.format(axis),
             (f"axis{axis}:{fault}",),
             _AT_ONCE,
             free=True,
         )
         for axis in (1, 2)
         for what, fault, cause in (
-            ("reversed encoder", "reverse", "has the wrong sign"),
-            ("encoder scale 2.5", "scale=2.5", "moves 2.* times as far"),
-            ("encoder scale 0.4", "scale=0.4", "moves 0.* times as far"),
-            ("motor 2.5 times as strong", "motor=2.5", "moves 2.* times as far"),
-            ("motor 0.4 times as strong", "motor=0.4", "moves 0.* times as far"),
+            ("reversed encoder", "reverse", "wrong sign: {}"),
+            ("encoder scale 2.5", "scale=2.5", "wrong scale: {} 2"),
+            ("encoder scale 0.4", "scale=0.4", "wrong scale: {} 0"),
+            ("motor 2.5 times as strong", "motor=2.5", "wrong scale: {} 2"),
+            ("motor 0.4 times as strong", "motor=0.4", "wrong scale: {} 0"),
         )
     ),
     *(
@@ -359,32 +368,30 @@ CASES = (
         for axis in (1, 2)
         for counts in (0.3, 0.5, 1.0)
     ),
-    Fault("dead encoder with noise before", G.STOPPED, "axis 1 does not follow", ("freeze", "noise=0.5"), _AT_ONCE),
+    Fault("dead encoder with noise before", G.STOPPED, "(dead|still) encoder: 1 ", ("freeze", "noise=0.5"), _AT_ONCE),
     Fault(
         "encoder with noise dies",
         G.STOPPED,
-        "axis 1 does not follow|dead",
+        "(dead|still) encoder: 1 |still handle: 1 ",
         ("noise=0.5", *at("freeze noise=0.5")),
         _DEAD,
     ),
     Fault("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Fault("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
-    Fault("motor 1 gets hot", G.STOPPED, "motor 1 gets hot", within=1500.0, continuous=(0.2, 12.0), lasts=2.7),
-    Fault("motor 2 gets hot", G.STOPPED, "motor 2 gets hot", within=1500.0, continuous=(12.0, 0.2), lasts=2.7),
-    Fault("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
-    Fault("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
+    Fault("motor 1 gets hot", G.STOPPED, "heat: 1 ", within=1500.0, continuous=(0.2, 12.0), lasts=2.7),
+    Fault("motor 2 gets hot", G.STOPPED, "heat: 2 ", within=1500.0, continuous=(12.0, 0.2), lasts=2.7),
+    Fault("firmware finds a fault", G.STOPPED, "device fault:", at("trip"), _STOP),
+    Fault("device clock runs 5 % fast", G.REFUSED, "device clock:", period=1.05),
     # the controller
-    Fault("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=_spoiled(np.nan)),
-    Fault("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=_spoiled(np.inf)),
+    Fault("controller asks for nan", G.STOPPED, "no force: nan nan", within=_STOP, action=_spoiled(np.nan)),
+    Fault("controller asks for inf", G.STOPPED, "no force: inf inf", within=_STOP, action=_spoiled(np.inf)),
     Fault("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=_spoiled(None)),
-    Fault(
-        "controller asks for -inf", G.STOPPED, "-inf, -inf N, which is no force", within=_STOP, action=_spoiled(-np.inf)
-    ),
+    Fault("controller asks for -inf", G.STOPPED, "no force: -inf -inf", within=_STOP, action=_spoiled(-np.inf)),
     Fault("controller asks for 100 N", A, action=_spoiled(100.0), counted=("clipped", "slowed"), lasts=0.6636),
     Fault("controller asks for -100 N", A, action=_spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.6636),
     # people
     Fault("planned stop", G.FINISHED, "asked to", within=100.0 + _TESTED + _STOP, action=person("stop"), lasts=1.2),
-    Fault("deadman let go", G.STOPPED, "deadman at the device", at("letgo"), 100.0 + _STOP, deadman=True),
+    Fault("deadman let go", G.STOPPED, "device deadman:", at("letgo"), 100.0 + _STOP, deadman=True),
     Fault("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
     # the handshake
     Fault("an older protocol", G.REFUSED, "version 1 .*give it the firmware", info=lambda i: i._replace(version=1)),
@@ -412,7 +419,7 @@ CASES = (
     ),
     Fault("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
     Fault("921600 baud", A, baud=921600),
-    Fault("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),
+    Fault("nobody there", G.LOST, "no answer:", ("up:drop=1",)),
 )
 
 
@@ -548,7 +555,7 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None, force: floa
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:
         wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")
-    if not re.search(case.cause, session.cause):
+    if not re.search(case.cause, cause_of(session.cause)):
         wrong.append(f"the cause is {session.cause!r}, expected {case.cause!r}")
     if case.within is not None and (zero_ms is None or zero_ms > case.within):
         wrong.append(f"zero force after {zero_ms} ms, allowed are {case.within:g} ms")

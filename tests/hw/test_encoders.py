@@ -1,11 +1,13 @@
 """Encoders that do not follow a handle are found at arming and under force; a hand that rests stops no session."""
 
+import re
 from contextlib import nullcontext
 from pathlib import Path
 from runpy import run_path
 
 import numpy as np
 import pytest
+from causes import cause_of, stopped_by
 from msgspec.structs import replace
 from sessions import in_fork, strike
 from shared import checkered
@@ -48,13 +50,13 @@ def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
     """The encoder is found before the gain rises, so nobody feels more than the test force."""
     session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
     assert session.stage == Stage.STOPPED
-    assert session.cause.startswith(f"encoder of axis {axis} does not follow: it moved by ")
+    assert cause_of(session.cause).startswith(f"dead encoder: {axis} ")
     assert max(np.abs(m.applied).max() for m in rehearsal.moments) <= 1.3
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
 def test_of_two_dead_encoders_the_first_is_named(scenario, rungs):
-    assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
+    assert cause_of(session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause).startswith("dead encoder: 1 ")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +153,7 @@ def test_the_test_force_stays_within_the_cap(cap):
         kept.append(applied)
         return (0, 0)
 
-    with pytest.raises(SafetyStop, match=f"axis 1 does not follow: it moved by 0 counts .* up to {min(1.3, cap):g} N"):
+    with stopped_by(f"dead encoder: 1 0 {min(1.3, cap):g}$"):
         played(test, still)
     moved, other = (kept[-1] * STEP).T
     assert not other.any()
@@ -171,28 +173,26 @@ def cut(test, most):
 @pytest.mark.parametrize("closing", [False, True])
 def test_a_force_cut_short_is_no_test(closing):
     """A test force that an energy budget cuts to 0.1 N does not show that the motor is dead."""
-    with pytest.raises(
-        SafetyStop, match=r"the energy left allows 0.1 of (1.3|2.5) N: motor and encoder of axis 1 are not"
-    ):
+    with stopped_by("little energy: 0.1 (1.3|2.5) 1$"):
         cut(arming_test(closing=closing), 0.1)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_wrong_sign_is_named_with_its_axis(axis):
     signs = (-1, 1) if axis == 1 else (1, -1)
-    with pytest.raises(SafetyStop, match=f"axis {axis} has the wrong sign"):
+    with stopped_by(f"wrong sign: {axis}"):
         played(arming_test(), masses(signs))
 
 
 def test_swapped_axes_are_named():
-    with pytest.raises(SafetyStop, match="a force on axis 1 moves encoder 2: axes are swapped"):
+    with stopped_by("swapped axes: 1 2"):
         played(arming_test(), masses(order=(1, 0)))
 
 
 @pytest.mark.parametrize(("scale", "refused"), [(1, False), (1.8, False), (0.55, False), (2.3, True), (0.45, True)])
 def test_motions_wrong_by_over_twice_are_refused(scale, refused):
     if refused:
-        with pytest.raises(SafetyStop, match=r"axis 1 moves .* times as far as expected of 0\.25 kg"):
+        with stopped_by(r"wrong scale: 1 \S+ 0\.25$"):
             played(arming_test(), masses(scale=scale))
     else:
         played(arming_test(), masses(scale=scale))
@@ -238,7 +238,7 @@ def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
     if share == 0.7:
         played(arming_test(q=q), weak)
     else:
-        with pytest.raises(SafetyStop, match="farther in one direction than in the other: its motor is weak in one"):
+        with stopped_by("one-sided motor:"):
             played(arming_test(q=q), weak)
 
 
@@ -257,8 +257,7 @@ def test_counts_lost_in_one_direction_are_named(sign, share, q):
         return round(1e-3 * np.where(sign * steps > 0, steps, share * steps).sum()), 0
 
     places, test = [], arming_test(q=q)
-    wrong = "axis 1 moves much farther in one direction than in the other: its encoder loses counts in one"
-    with pytest.raises(SafetyStop, match="axis 2" if share == 0.7 else wrong):
+    with stopped_by("dead encoder: 2 " if share == 0.7 else "one-sided encoder: 1"):
         played(test, lossy)
 
 
@@ -273,7 +272,7 @@ def test_a_dead_zone_is_named(zone, friction, q):
         force = applied * STEP
         return rubs(k, np.sign(force) * np.maximum(np.abs(force) - zone, 0.0) / STEP)
 
-    with pytest.raises(SafetyStop, match="not because of dry friction: its motor has a dead zone"):
+    with stopped_by("dead zone: 1 "):
         played(arming_test(q=q), zoned)
 
 
@@ -286,13 +285,13 @@ def test_a_saturated_motor_fails_the_last_test(most, mass):
     if most > 1.3:
         played(last, limited)
     else:
-        with pytest.raises(SafetyStop, match=r"axis 1 moves 0\.(47|69) times as far as"):
+        with stopped_by(r"(wrong scale|weaker motor): 1 0\.(47|69)"):
             played(last, limited)
 
 
 def test_friction_hides_no_wrong_sign():
     rubs = rubbing(0.17)
-    with pytest.raises(SafetyStop, match="axis 1 has the wrong sign"):
+    with stopped_by("wrong sign: 1"):
         played(arming_test(), lambda k, applied: tuple(-n for n in rubs(k, applied)))
 
 
@@ -313,7 +312,7 @@ def test_coarse_counts_are_no_hidden_delay(q):
     played(arming_test(closing=True, q=q), masses(q=q))
     if q <= 1e-4:
         assert not test.remarks
-        with pytest.raises(SafetyStop, match=r"axis 1 answers .* ticks later"):
+        with stopped_by("late axis: 1 "):
             played(arming_test(q=q), later(masses(q=q), 2))
     else:
         assert all(f"delay of axis {i} is not tested" in told for i, told in enumerate(test.remarks, 1))
@@ -331,7 +330,7 @@ def test_a_moving_hand_hides_no_sign(hand, sign):
     alone = masses((sign, sign))
     moved = lambda k, applied: tuple(n + round(hand(k * T) / 1e-6) for n in alone(k, applied))  # noqa: E731
     if sign < 0:
-        with pytest.raises(SafetyStop, match="axis 1 has the wrong sign"):
+        with stopped_by("wrong sign: 1"):
             played(arming_test(), moved)
     else:
         played(arming_test(), moved)
@@ -347,7 +346,7 @@ def test_a_moving_hand_is_no_motor(hand, closing):
 def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
     session, _ = session_with(scenario, rungs, f"axis{axis}:scale={scale}")
     assert session.stage == Stage.STOPPED
-    assert session.cause.startswith(f"axis {axis} moves {scale} times as far as expected")
+    assert cause_of(session.cause).startswith(f"wrong scale: {axis} {scale} ")
 
 
 def live(scenario, rungs, hand):
@@ -387,7 +386,7 @@ def test_sessions_finish_once_handles_are_let_go(scenario, rungs, hand):
     """A firm hand is asked to let go, not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
     stage, cause, log = ended(live(scenario, rungs, hand), lets_go=2.5)
     assert stage == Stage.FINISHED, cause
-    assert hand[0] < 0.3 or "let go of the handle of axis 1" in log
+    assert hand[0] < 0.3 or any("let go" in request and "axis 1" in request for request in log)
 
 
 @pytest.mark.slow
@@ -396,10 +395,7 @@ def test_sessions_with_held_handles_never_finish(scenario, rungs, monkeypatch):
     monkeypatch.setattr("haptic_loop.hw.encoders._LETTING_GO", 1.5)
     stage, cause, _ = ended(live(scenario, rungs, (0.4, 3.0, 100.0)))
     assert stage == Stage.STOPPED
-    assert cause == (
-        "axis 1 did not move as a free handle at the end: let go of all handles before a session ends. If nobody held "
-        "it, motor or encoder is wrong"
-    )
+    assert cause_of(cause) == "held at the end: 1"
 
 
 @pytest.fixture(scope="module")
@@ -418,7 +414,7 @@ def test_short_live_sessions_find_what_became_wrong(gripped, fault):
     """A firm hand hides a fault that begins at full gain, until the hand lets go."""
     stage, cause, _ = in_fork(lambda: ended(gripped, f"{fault}@0.8", lets_go=1.3))
     assert stage == Stage.STOPPED, cause
-    assert "let go" not in cause
+    assert not cause_of(cause).startswith("held at the end")
 
 
 @pytest.mark.parametrize("at", [0.05, 0.3])
@@ -460,12 +456,13 @@ def test_dead_encoders_with_noise_are_found(scenario, rungs, noise):
     tests/checks/faults.py arms live encoders with the same noise, and has dead ones with a noise of 0.5 counts.
     """
     dead, _ = session_with(scenario, rungs, "axis1:freeze", f"axis1:noise={noise}")
-    assert (dead.stage, dead.cause[:36]) == (Stage.STOPPED, "encoder of axis 1 does not follow: i")
+    assert dead.stage == Stage.STOPPED
+    assert cause_of(dead.cause).startswith("dead encoder: 1 ")
     later, _ = session_with(
         scenario, rungs, f"axis1:noise={noise}", "axis1:freeze@0.45", f"axis1:noise={noise}@0.45", seconds=2.0
     )
     assert later.stage == Stage.STOPPED
-    assert "axis 1" in later.cause
+    assert re.match("still (encoder|handle): 1 ", cause_of(later.cause))
 
 
 @pytest.mark.parametrize("strength", [1, 0])
@@ -479,7 +476,7 @@ def test_noisy_coarse_counts_show_the_motor(strength):
     if strength:
         played(test, noisy)
     else:
-        with pytest.raises(SafetyStop, match=r"encoder of axis 1 does not follow: it moved by \d counts"):
+        with stopped_by(r"dead encoder: 1 \d "):
             played(test, noisy)
 
 
@@ -509,7 +506,7 @@ def test_still_encoders_under_force_are_dead(newton, found):
     assert monitor.dead is None
     for _ in range(round(0.1 / T)):
         monitor.check((0,), (round(newton / STEP),), 1)
-    assert (monitor.dead == "encoder or motor of axis 1 is dead: nothing moves for 0.5 s under a force") == found
+    assert (monitor.dead is not None and cause_of(monitor.dead) == "still handle: 1 0.5") == found
 
 
 @pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
@@ -539,7 +536,7 @@ def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, s
     )
     session, _ = session_with(scenario.replace(human=turned), rungs, f"axis{axis}:{kind}@0.45", seconds=1.2)
     assert session.stage == Stage.STOPPED
-    assert session.cause.startswith(f"encoder of axis {axis} does not follow: it stands still")
+    assert cause_of(session.cause).startswith(f"still encoder: {axis} ")
     assert 1e-6 * (session.log[-1].t_us - session.log[-2].t_us) < 0.7
 
 
@@ -547,7 +544,7 @@ def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, s
 def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
     session, _ = session_with(scenario, rungs, f"axis{axis}:saturate={most}@0.3", seconds=2.0)
     assert session.stage == Stage.STOPPED
-    assert session.cause.startswith((f"encoder of axis {axis} does not follow", f"encoder {axis} jumped"))
+    assert re.match(f"(still encoder|jump|jolt): {axis} ", cause_of(session.cause))
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -566,7 +563,7 @@ def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
     if after is None:
         return stand_still(1000)
     stand_still(round(0.9 * after / T))
-    with pytest.raises(SafetyStop, match=f"axis {axis + 1} does not follow"):
+    with stopped_by(f"still encoder: {axis + 1} "):
         stand_still(round(0.2 * after / T) + 1)
     return None
 
@@ -574,7 +571,7 @@ def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
 @pytest.mark.parametrize(("cap", "far", "closing"), [(0.05, "0.039", False), (0.15, "0.12", True)])
 def test_motions_below_two_counts_test_nothing(cap, far, closing):
     """At 0.05 N the free mass swings by 0.039 mm, which an encoder with counts of 0.1 mm hardly shows."""
-    with pytest.raises(SafetyStop, match=rf"axis 1 by {far} mm, less than 2 counts of 0\.1 mm: .* Raise --force-cap"):
+    with stopped_by(rf"faint test: {cap} 1 {far} 2 0\.1$"):
         played(arming_test(cap=cap, q=1e-4, closing=closing), masses(q=1e-4))
 
 
@@ -596,7 +593,7 @@ def test_coarse_encoders_get_more_time():
             monitor.check((0,), (12_500,), 1)
 
     stand_still(47)
-    with pytest.raises(SafetyStop, match="axis 1 does not follow"):
+    with stopped_by("still encoder: 1 "):
         stand_still(1)
 
 
@@ -604,7 +601,7 @@ def test_coarse_encoders_get_more_time():
 def test_friction_hides_twice_its_force(friction, stops):
     """A hand of 500 N/m holds a handle with dry friction F, which rests while a slow force turns round by 2 F."""
     monitor, x = monitor_of(1e-5), 0.0
-    with pytest.raises(SafetyStop, match="stands still while the force") if stops else nullcontext():
+    with stopped_by("still encoder: 1 ") if stops else nullcontext():
         for k in range(round(5.0 / T)):
             force = 3.0 * np.sin(2 * np.pi * 0.3 * k * T)
             x = min(max(x, (force - friction) / 500), (force + friction) / 500)
@@ -659,7 +656,7 @@ def test_handles_off_centre_feel_little_force(scenario, rungs, place):
 
 def test_the_range_counts_from_the_middle(scenario, rungs):
     session, _ = session_with(nobody(scenario), rungs, "axis2:jump=99.5", "axis1:jump=-101", seconds=0.2)
-    assert "encoder 1 is at -101 mm, its range is" in session.cause
+    assert cause_of(session.cause).startswith("range: 1 -101 ")
 
 
 def test_faults_of_impossible_axes_are_refused(scenario):
@@ -672,5 +669,5 @@ def test_faults_of_impossible_axes_are_refused(scenario):
 def test_weak_motors_have_smaller_thresholds():
     """The dead encoder of a knob of 20 mN m, held at 20 mm, is found within 1 s under 15 mN m."""
     knob = monitor_of(1e-4, 1e-6, cap=(0.02,), slew=40.0, lever=0.02)
-    with pytest.raises(SafetyStop, match="axis 1 does not follow"):
+    with stopped_by("still encoder: 1 "):
         [knob.check((0,), (15_000,), 1) for _ in range(round(1.0 / T))]

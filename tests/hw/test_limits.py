@@ -23,6 +23,7 @@ from haptic_loop.hw.monitor import CommandMonitor
 from haptic_loop.hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
 from haptic_loop.hw.session import _check_state
 from haptic_loop.sim.scenario import load
+from tests.causes import stopped_by
 
 LIMITS = SafetyLimits((12.0, 6.0))
 T = 1.2e-3
@@ -37,7 +38,7 @@ def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
         max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
     )
     if not all(map(math.isfinite, asked)):
-        with pytest.raises(SafetyStop, match="which is no force"):
+        with stopped_by("no force:"):
             LIMITS.shape(asked, before, gain, T)
         return
     shaped = LIMITS.shape(asked, before, gain, T)
@@ -77,7 +78,7 @@ def test_a_vector_keeps_its_direction_at_its_cap():
 
 def test_forces_of_nan_are_refused_before_clipping():
     assert max(-12.0, min(12.0, math.nan)) == 12.0
-    with pytest.raises(SafetyStop, match="asked for nan, 0 N, which is no force"):
+    with stopped_by("no force: nan 0$"):
         LIMITS.shape((math.nan, 0.0), (0.0, 0.0), 0.0, T)
 
 
@@ -139,7 +140,7 @@ def test_caps_above_twelve_newtons_are_refused():
 @pytest.mark.parametrize(("moved", "ticks", "fault"), [(2.9e-3, 1, False), (3.1e-3, 1, True), (5.9e-3, 2, False)])
 def test_jumps_are_measured_per_tick(moved, ticks, fault):
     if fault:
-        with pytest.raises(SafetyStop, match=r"encoder 2 jumped by 3\.1 mm, allowed are 3 mm in 1 tick"):
+        with stopped_by(r"jump: 2 3\.1 3 1$"):
             LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
     else:
         LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
@@ -285,12 +286,9 @@ def test_counting_errors_are_no_motion():
         ((0, 0, jump, jump), (3, 1, 2)),
     ):
         for sign in (1, -1):
-            limit = "one tick" if gaps[1] == 1 else "2 ticks"
-            with pytest.raises(
-                SafetyStop, match=f"encoder 1 jumped by .* mm: no force can move it by 1 mm in {limit} and"
-            ):
+            with stopped_by(r"jolt: 1 \S+ 1$" if gaps[1] == 1 else r"jolt: 1 \S+ 1 2$"):
                 LIMITS.check_jolt([(sign * x,) for x in path], gaps, most)
-    with pytest.raises(SafetyStop, match=r"encoder 2 jumped by 1\.1 mm"):
+    with stopped_by(r"jolt: 2 1\.1 "):
         LIMITS.check_jolt([(0.0, x) for x in (0, 0, jump, jump)], (1, 1, 1), most * 2)
 
 
@@ -329,14 +327,14 @@ def on(channel, value, rest=0.0):
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
 def test_motion_checks_cover_channels_and_signs(channel, sign):
-    for name, inside, outside, check in (
-        (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jump(x, (0.0, 0.0), 1)),
-        (f"encoder {channel + 1} is at", 10**5, 10**5 + 1, lambda n: Units.of(INFO).check_range(n)),
-        (f"axis {channel + 1} moves at", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed(x, (0.0, 0.0), 0.01)),
-        (f"axis {channel + 1} moves at", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
+    for cause, inside, outside, check in (
+        (f"jump: {channel + 1} ", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jump(x, (0.0, 0.0), 1)),
+        (f"range: {channel + 1} ", 10**5, 10**5 + 1, lambda n: Units.of(INFO).check_range(n)),
+        (f"speed: {channel + 1} ", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed(x, (0.0, 0.0), 0.01)),
+        (f"speed: {channel + 1} ", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
     ):
         check(on(channel, sign * inside))
-        with pytest.raises(SafetyStop, match=name):
+        with stopped_by(cause):
             check(on(channel, sign * outside))
 
 
@@ -360,9 +358,9 @@ def test_cap_and_slew_cover_channels_and_signs(channel, sign):
 @pytest.mark.parametrize("channel", [0, 1])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_invalid_forces_are_found_on_both_channels(channel, value):
-    with pytest.raises(SafetyStop, match="which is no force"):
+    with stopped_by("no force:"):
         LIMITS.shape(on(channel, value), (0.0, 0.0), 0.0, T)
-    with pytest.raises(SafetyStop, match="which is no force"):
+    with stopped_by("no force:"):
         LIMITS.shape((0.0, 0.0), (0.0, 0.0), 0.0, T, on(channel, math.nan))
 
 
@@ -383,7 +381,7 @@ def test_motor_heat_grows_with_squared_force(channel, sign):
             heat.check(on(channel, sign * 4.0), 1)
             ticks += 1
 
-    with pytest.raises(SafetyStop, match=rf"motor {channel + 1} gets hot: 2 N rms, 2 N are allowed for long"):
+    with stopped_by(f"heat: {channel + 1} 2 2$"):
         push(Heat(limits, T))
     assert ticks * T == pytest.approx(5.0 * math.log(4 / 3), abs=2 * T)
     at_once = Heat(limits, T)
@@ -403,9 +401,9 @@ def test_device_reports_are_checked_on_all_channels(channel, sign):
 
     cap = config.cap[channel]
     _check_state(said(0, cap), config, Stage.ARMED, 1.0)
-    with pytest.raises(SafetyStop, match=r"the device applies .* the cap is"):
+    with stopped_by("force above the cap:"):
         _check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
-    with pytest.raises(SafetyStop, match="is disarmed and applies"):
+    with stopped_by("force without arming:"):
         _check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
     for told, applied, wrong in ((500, 500, False), (500, 501, False), (500, 502, True), (500, 498, True)):
         monitor = CommandMonitor(config)
@@ -434,5 +432,5 @@ def test_force_steps_are_judged_by_the_cap():
     twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)
     assert SafetyLimits((2.0, 2.0)).objections(eight, load(), None) == []
     coarse = SafetyLimits((0.5, 0.5)).objections(eight, load(), None)
-    assert coarse[0] == "one force step of axis 1 is 0.047059 N, at most 0.03125 N is allowed"
+    assert all(number in coarse[0] for number in ("axis 1", "0.047059 N", "0.03125 N"))
     assert SafetyLimits((0.5, 0.5)).objections(twelve, load(), None) == []
