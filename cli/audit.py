@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     if args.coupling and not _is_own(args):
         notes = from_file(read_coupling(args.coupling), loop, own=condition).notes
     _, own = name_and_own(condition)
-    notes = (*notes, own.said(audited.assessment.requirements[own.name])) if own else notes
+    notes = (*notes, own.remark(audited.assessment.requirements[own.name])) if own else notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,

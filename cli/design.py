@@ -164,8 +164,8 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
         make = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **further)
         if args.decay is None:
             return proved(loop, make(loop)), None
-        if not kind_of(args.coupling).softened:
-            able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
+        if not kind_of(args.coupling).for_less_damping:
+            able = " or ".join(name for name, kind in KINDS.items() if kind.for_less_damping)
             raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
     with render.progress("designing softer and softer couplings"):
         design, decay = _decaying_design(scenario, loop, make, args.decay)
@@ -305,7 +305,7 @@ def _reported(
         stored=stored,
         interrupted=interrupted,
         compared="; ".join(design.notes) or None,
-        claim=design.own and design.own.said(assessment.requirements[design.condition]),
+        claim=design.own and design.own.remark(assessment.requirements[design.condition]),
     )
 
 

@@ -373,7 +373,7 @@ class Condition(ABC):
         """The sentence that reports print if a user's own condition holds."""
         return f"only the block of {self.name} is proved; that it keeps this loop safe is yours to show"
 
-    def said(self, needs: Requirement) -> str:
+    def remark(self, needs: Requirement) -> str:
         return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:

@@ -33,7 +33,7 @@ class _Kind(NamedTuple):
     options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether designs try by default to cover limited forces
-    softened: bool = False  # whether designs may be repeated for less damping until a user's own condition holds
+    for_less_damping: bool = False  # whether designs may be repeated for less damping for a user's own condition
 
 
 KINDS = {
@@ -44,10 +44,10 @@ KINDS = {
         ("condition",),
         ("switching", "limiter", "band_hz"),
         limited=True,
-        softened=True,
+        for_less_damping=True,
     ),
     "moving-average": _Kind(
-        (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), softened=True
+        (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), for_less_damping=True
     ),
     "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "diagonal")),
     "optimal": _Kind(
@@ -126,8 +126,8 @@ def design_by_kind(
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and FILE.py:NAME of your own")
     chosen = KINDS[kind]
-    if own and not chosen.softened:
-        able = ", ".join(other for other in KINDS if KINDS[other].softened)
+    if own and not chosen.for_less_damping:
+        able = ", ".join(other for other in KINDS if KINDS[other].for_less_damping)
         why = f"{kind} couplings are not designed for a condition of your own, allowed are {able} and FILE.py:NAME"
         raise ValueError(f"condition is {own.name}: {why}; your condition can judge a stored coupling FILE.json")
     condition_name = usual_condition(loop, kind) if own or not name else name

@@ -111,7 +111,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return the block, affine in s and in `multiplier`, whose numbers for the hands' side are multiplied by s."""
+        """Return the block, affine in s and in `multiplier`, which holds s times the multipliers of the hands' side."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:

@@ -346,7 +346,7 @@ class Sweep:
         return positive(_with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
     def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
-        """Return the least share (k,) up to `high` that `holds` at each frequency; inf where `high` is not enough."""
+        """Return the least share (k,) that passes `holds` at each frequency; inf where that exceeds `high`."""
         k, low = z.size, self.floor(beta)
         if not low < high:
             return np.full(k, np.inf)
@@ -558,7 +558,7 @@ class _Search:
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
 
     def cut(self, x: Array, binding: tuple[int, int] | None = None) -> None:
-        """Add tangents at x for `binding`, (environment, index of a frequency), or if it is None for `lowest`."""
+        """Add the tangent at x for `binding`, an (environment, index of a frequency); None adds those of `lowest`."""
         places = [binding] if binding else self.lowest(x)
         for e, at in places:
             z, parts = self.sampled[e]

@@ -61,7 +61,8 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
         return other
     if other is not None and other not in _LOADED.values():
         raise InputError(f"{option} is {text!r}: another module with the name {file.stem} is loaded; rename the file")
-    reach(str(file.parent))
+    if (folder := str(file.parent)) not in sys.path:
+        sys.path.insert(0, folder)
     spec = spec_from_file_location(file.stem, file)
     assert spec
     assert spec.loader
@@ -77,11 +78,6 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
         raise
     _LOADED[file] = module
     return module
-
-
-def reach(folder: str) -> None:
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
 
 
 def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:

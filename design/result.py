@@ -227,7 +227,7 @@ class Chosen:
 
     def remarks(self, requirements: Mapping[str, Requirement]) -> tuple[str, ...]:
         """Return the notes, and whether the user's own condition holds."""
-        return (*self.notes, self.own.said(requirements[self.own.name])) if self.own else self.notes
+        return (*self.notes, self.own.remark(requirements[self.own.name])) if self.own else self.notes
 
     def fails(self, requirements: Mapping[str, Requirement]) -> bool:
         """Return whether there is a user's own condition that does not hold."""
