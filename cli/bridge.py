@@ -80,16 +80,18 @@ def main(argv: list[str]) -> int:
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
-    try:  # The figures are printed before files are written, because the disk may be full.
+    unprinted: OSError | None = None
+    try:  # The figures are printed before files are written, because either disk may be full.
         _print_session(report, render.console(args), args.details)
-    except OSError:
-        if signal.SIGHUP not in live.signals:
-            raise
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is closed
+    except OSError as error:
+        unprinted = None if signal.SIGHUP in live.signals else error  # SIGHUP: the terminal is closed
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - for as long as the command runs
     files = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
+    if unprinted:
+        raise unprinted
     return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 

@@ -1,5 +1,6 @@
 """Test the deadman, limits, the incident log after a kill, the pre-flight of the machine, and rehearsals."""
 
+import errno
 import itertools
 import json
 import os
@@ -266,6 +267,21 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):
         IncidentLog(tmp_path)
+
+
+def test_figures_that_cannot_be_printed_are_stored(tmp_path, monkeypatch):
+    """Standard output is on a full disk, and the session's folder is on another one."""
+
+    def full(*shown):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(bridge, "_print_session", full)
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # The command replaces it.
+    words = "--rehearse --duration 0.1 --measure 60 --coupling moving-average --no-plot --out"
+    with pytest.raises(OSError, match="No space left"):
+        bridge.main([*words.split(), str(tmp_path)])
+    sys.stdout.close()  # the null device
+    assert {path.name for path in tmp_path.iterdir()} == {"incidents.jsonl", "report.json", "trace.csv", "trace.npz"}
 
 
 @pytest.mark.slow
