@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from messages import says
 from msgspec.structs import replace
 from shared import SOFT
 
@@ -38,6 +39,7 @@ from haptic_loop.controller.environment import Spring
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design.assessment import ForceLimits, RangesResult
 from haptic_loop.design.designs import KINDS
+from haptic_loop.design.result import HERE
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import SCENARIOS
@@ -87,7 +89,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     design = design_coupling(loop)
     assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert assess(loop, design).guarantee.environments == safe_with(report) == "this environment"
+    assert assess(loop, design).guarantee.environments == safe_with(report) == HERE
     figures = transparency_of(loop, design)
     assert figures.mismatch_db == report["assessment"]["transparency"]["relative_mismatch_db"]
     assert figures == transparency_of(loop, design.coupling)
@@ -103,7 +105,7 @@ def test_rehearsed_sessions_finish_with_their_guarantee():
     scenario = load().replace(T=1e-3, theta=(1, 1))
     session = rehearse(scenario, seconds=0.5)
     assert (session.stage, session.theta) == ("finished", (1, 1))
-    assert session.assessment.guarantee.environments == "this environment"
+    assert session.assessment.guarantee.environments == HERE
     assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
     designed = design_coupling(scenario.loop("I")).coupling
     np.testing.assert_array_equal(session.coupling.K, designed.K)
@@ -211,20 +213,20 @@ def test_the_reported_seed_draws_the_periods():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: simulate(SHORT, engine="magic"), "engine is 'magic', allowed are mujoco, exact"),
-        (lambda: simulate(SHORT, substeps=0), "substeps is 0, allowed are 1 to 10000"),
+        (lambda: simulate(SHORT, engine="magic"), "engine is 'magic'.*mujoco, exact"),
+        (lambda: simulate(SHORT, substeps=0), "substeps is 0.*1 to 10000"),
         (lambda: simulate(SHORT, integrator="Euler3"), "Euler3"),
-        (lambda: validate(SHORT, humans=0), "humans is 0, allowed are 1 to 1000000"),
-        (lambda: validate(SHORT, engine="magic"), "engine is 'magic', allowed are exact, mujoco, both"),
-        (lambda: validate(SHORT, duration=1e-3), "duration is 0.001, allowed are 0 and 0.0048 s or more"),
+        (lambda: validate(SHORT, humans=0), "humans is 0.*1 to 1000000"),
+        (lambda: validate(SHORT, engine="magic"), "engine is 'magic'.*exact, mujoco, both"),
+        (lambda: validate(SHORT, duration=1e-3), "duration is 0.001.*0 and 0.0048 s or more"),
         (lambda: validate(SHORT, shards=0), "shards is 0"),
         (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device #1.friction is 0.2 N"),
-        (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber', allowed are spring-damper"),
+        (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber'.*spring-damper"),
         (lambda: rehearse(SHORT.replace(delta=(0.0, 0.0))), r"delta is \[0.0, 0.0\]: a device without damping"),
-        (lambda: rehearse(SHORT, case="none"), "case is 'none', allowed are I, II"),
-        (lambda: rehearse(SHORT, seconds=0), "seconds is 0, allowed are 0.1 to 3600"),
-        (lambda: simulate(SHORT, seed=-1), "seed is -1, allowed are 0 or more"),
-        (lambda: validate(SHORT, seed=-1), "seed is -1, allowed are 0 or more"),
+        (lambda: rehearse(SHORT, case="none"), "case is 'none'.*I, II"),
+        (lambda: rehearse(SHORT, seconds=0), "seconds is 0.*0.1 to 3600"),
+        (lambda: simulate(SHORT, seed=-1), "seed is -1.*0 or more"),
+        (lambda: validate(SHORT, seed=-1), "seed is -1.*0 or more"),
         (lambda: SpringDamper(800, 0.4), r"K is 800, expected a list of numbers, got shape \(\)"),
         (lambda: SpringDamper([800], 0.4), r"B is 0.4, expected a list of numbers, got shape \(\)"),
         (lambda: SpringDamper(["a"], [0.4]), r"K is \['a'\], expected a list of numbers"),
@@ -248,13 +250,13 @@ LOOP = SHORT.loop("I")
             lambda: design_coupling(LOOP, "optimal", objectiv=3),
             "objectiv is no option of kind 'optimal' (did you mean",
         ),
-        (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
+        (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper' .. switching"),
         (
             lambda: design_coupling(LOOP, "moving-average", order=3),
             "order is no option of kind 'moving-average', which has none",
         ),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
-        (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 to 10"),
+        (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float) .. whole numbers, 1 to 10"),
         (lambda: certify(SHORT, SOFT), "loop is a Scenario, expected a Loop"),
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
         (
@@ -265,15 +267,15 @@ LOOP = SHORT.loop("I")
         (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
         (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
-        (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),
-        (lambda: simulate(SHORT, substeps=True), "substeps is True (bool), allowed are whole numbers"),
+        (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float) .. whole numbers, 1 to 10000"),
+        (lambda: simulate(SHORT, substeps=True), "substeps is True (bool) .. whole numbers"),
         (lambda: simulate(SHORT, environment=3), "environment is 3 (int), expected a function of one array"),
-        (lambda: simulate(SHORT, seed="x"), "seed is 'x' (str), allowed are whole numbers, 0 or more"),
+        (lambda: simulate(SHORT, seed="x"), "seed is 'x' (str) .. whole numbers, 0 or more"),
         (lambda: validate("omega-pair"), "scenario is 'omega-pair' (str), expected a Scenario"),
         (lambda: validate(SHORT, {"K": 1}), "coupling is {'K': 1} (dict), expected a coupling"),
-        (lambda: validate(SHORT, humans=1.5), "humans is 1.5 (float), allowed are whole numbers, 1 to 1000000"),
+        (lambda: validate(SHORT, humans=1.5), "humans is 1.5 (float) .. whole numbers, 1 to 1000000"),
         (lambda: validate(SHORT, duration="1"), "duration is '1' (str), expected a number of seconds"),
-        (lambda: validate(SHORT, shards=2.0), "shards is 2.0 (float), allowed are whole numbers, 1 or more"),
+        (lambda: validate(SHORT, shards=2.0), "shards is 2.0 (float) .. whole numbers, 1 or more"),
         (lambda: rehearse(LOOP), "scenario is a Loop, expected a Scenario"),
         (lambda: rehearse(SHORT, "ccl"), "coupling is 'ccl' (str), expected a coupling"),
         (lambda: RigidDevice(damping="x"), "damping is 'x', expected a number"),
@@ -282,7 +284,7 @@ LOOP = SHORT.loop("I")
 def test_an_argument_of_another_type_is_named(call, message):
     with pytest.raises(TypeError) as caught:
         call()
-    assert message in str(caught.value)
+    assert says(caught.value, message)
 
 
 def test_help_describes_every_result_field():
@@ -347,7 +349,7 @@ def test_a_trace_draws_itself(tmp_path):
     assert (screen.get_size_inches()[0], paper.get_size_inches()[0]) == (11, 7.16)
     assert (tmp_path / "run.pdf").read_bytes().startswith(b"%PDF-")
     np.testing.assert_array_equal(screen.axes[1].lines[0].get_ydata(), trace.f[:, 0])
-    with pytest.raises(InputError, match=r"the suffix is '.jpg', allowed are .png, .pdf, .svg"):
+    with pytest.raises(InputError, match=r"the suffix is '.jpg'.*.png, .pdf, .svg"):
         trace.plot(tmp_path / "run.jpg")
 
 

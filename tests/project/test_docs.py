@@ -165,9 +165,15 @@ def test_page_blocks_end_and_follow_their_comments(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_links_and_pictures_exist(page):
+def test_links_pictures_and_named_tests_exist(page):
+    """A page names a test as file::test, or as ::test of the file that it named before."""
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXTS[page]):
         assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name} names {target}"
+    file = None
+    for path, name, test in re.findall(r"(tests/[\w/]+\.py)?(\btest_\w+\.py)?::(\w+)", TEXTS[page]):
+        files = [ROOT / path] if path else list((ROOT / "tests").rglob(name)) if name else [file]
+        assert any(f"def {test}(" in file.read_text() for file in files), f"{page.name} names {test}"
+        file = files[0]
 
 
 def test_make_targets_that_pages_name_exist():
@@ -177,8 +183,3 @@ def test_make_targets_that_pages_name_exist():
     named += re.findall(r"`make ([a-z]+)`", "".join(TEXTS.values()))
     assert named
     assert set(named) <= set(targets)
-
-
-def test_there_are_commands_to_run():
-    assert len(IN_ORDER) >= 20
-    assert len(SHOWN) >= 5

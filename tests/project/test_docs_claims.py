@@ -1,6 +1,5 @@
-"""Tests that the documentation names exist, and its table of guarantees agrees with the code."""
+"""The table of guarantees agrees with the code, and documented commands leave no files behind."""
 
-import ast
 import re
 import shutil
 import subprocess
@@ -12,35 +11,6 @@ from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIR
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
 
 ROOT = Path(__file__).parents[2]
-MENTION = re.compile(r"(?:tests/(?:\w+/)*(test_\w+\.py))?::(\w+)")
-DOCS = ("theory.md", "reproducibility.md")
-
-
-def defined_in(name: str) -> set[str]:
-    """Return the names of the test functions that the files of this name define, without importing them."""
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "tests").rglob(name)]
-    nodes = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef)]
-    return {node.name for node in nodes if node.name.startswith("test_")}
-
-
-@pytest.mark.parametrize("name", DOCS)
-def test_every_test_that_the_documentation_names_exists(name):
-    """`::test` without a file belongs to the file that was named before it."""
-    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-    missing, file = [path for path in re.findall(r"tests/[\w/]+\.py", text) if not (ROOT / path).exists()], ""
-    for own, test in MENTION.findall(text):
-        file = own or file
-        if test not in defined_in(file):
-            missing.append(f"{file}::{test}")
-    assert file
-    assert not missing
-
-
-def test_reproducibility_rows_name_their_evidence():
-    text = (ROOT / "docs" / "reproducibility.md").read_text(encoding="utf-8")
-    rows = [line for line in text.splitlines() if line.startswith("| ") and not re.match(r"\|[ |-]+$", line)]
-    assert len(rows) > 8
-    assert [row for row in rows[1:] if not MENTION.search(row)] == []
 
 
 def test_documented_commands_leave_the_repository_clean():
@@ -51,7 +21,7 @@ def test_documented_commands_leave_the_repository_clean():
     blocks = re.findall(r"^```(?:sh|console)\n(.*?)^```", "".join(texts), flags=re.DOTALL | re.MULTILINE)
     written = {name for block in blocks for name in re.findall(r"--(?:out|video|json) ([\w./-]+)", block)}
     files = sorted(name for name in written if not name.startswith(("/", "out/")))
-    assert len(files) >= 5
+    assert files
     done = subprocess.run(["git", "check-ignore", *files], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == files
 
