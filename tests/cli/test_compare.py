@@ -8,7 +8,7 @@ import pytest
 
 from haptic_loop.cli.compare import _beside, _nearest, main
 from haptic_loop.cli.run import main as run_once
-from haptic_loop.design.result import Requirement
+from haptic_loop.design.result import ANY, HERE, Requirement
 from haptic_loop.sim.comparison import Alternative
 from haptic_loop.sim.scenario import InputError
 
@@ -34,7 +34,7 @@ def test_each_coupling_has_its_guarantee_and_error(compared):
     assert none["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
     assert (none["guarantee"], none["force_error_percent"]) == (None, None)
     assert none["required_damping"]["this-environment"] == pytest.approx([1.7229] * 2, rel=1e-4)
-    assert free["guarantee"] == "any passive environment"
+    assert free["guarantee"] == ANY
     assert [row["dc_ratio"] for row in (free, here, best)] == pytest.approx([0.476, 0.850, 1.0], abs=1e-3)
     # the rms mismatch over the band is 1.8 %; the slow motion of this run has a smaller error
     assert best["force_error_percent"] == pytest.approx(0.58, abs=0.1)
@@ -83,11 +83,11 @@ def test_tables_show_growing_loops_without_error():
     needs = {"this-environment": Requirement("this-environment", (0.5,), (1.0,), None)}
     rows = [
         Alternative("none", None, growth_rate_per_s=1.0, force_error_percent=7.0),
-        Alternative("optimal", "this-environment", "this environment", 0.9, -30.0, -1.0, 3.21, requirements=needs),
+        Alternative("optimal", "this-environment", HERE, 0.9, -30.0, -1.0, 3.21, requirements=needs),
         Alternative("published", None, reason="it is of another loop"),
     ]
     columns = {column.header: list(column.cells) for column in _beside(rows, None).columns}
     assert columns["coupling"] == ["none", "optimal", "published"]
     assert columns["error"] == ["grows", "3.21 %", ""]
-    assert columns["guarantee"] == ["none", "this environment", "not possible: it is of another loop"]
+    assert columns["guarantee"] == ["none", HERE, "not possible: it is of another loop"]
     assert columns["stiffness"] == ["-", "90 %", ""]

@@ -22,7 +22,7 @@ from haptic_loop.controller.tick import Process
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import requirement
 from haptic_loop.design.certificate import prove, requirements_of
-from haptic_loop.design.result import MAKING
+from haptic_loop.design.result import ANY, MAKING
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population
@@ -242,7 +242,7 @@ def test_a_run_reports_contact_and_its_certificate(tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     soft, bare = run(), run("--case", "none")
-    assert safe_with(soft) == "any passive environment"
+    assert safe_with(soft) == ANY
     assert any("any-environment covers it" in line for line in soft["remarks"])
     assert soft["stability"]["contact"]["made"] == 2
     assert [state["touching"] for state in soft["stability"]["contact"]["frozen"]] == [[], [1]]
@@ -267,7 +267,7 @@ def test_walls_need_more_damping_than_frozen_states():
     assert requirement.ratio > max(single.ratio for single in singles)
     assert len({single.ratio for single in singles}) == 4
     assert requirement.proof == "rational"
-    assert prove(loop, SOFT, "any-environment").guarantee == "any passive environment"
+    assert prove(loop, SOFT, "any-environment").guarantee == ANY
     late = boxed(load()).replace(psi=(1, 0)).loop("I")
     assert "no walls" in (requirements_of(late, SOFT)["any-environment"].reason or "")
 

@@ -24,7 +24,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, ThisEnvironment
-from haptic_loop.design.result import HERE, Design, NotProved, listed
+from haptic_loop.design.result import HERE, RANGES, Design, NotProved, listed
 from haptic_loop.design.robustness import ranges_around
 from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
@@ -198,7 +198,7 @@ def test_limited_forces_are_not_searched_between_vertices():
     between = loop.at(change(network, masses={"mass": 0.2}))
     assert limits.force_limits.requirement.certified
     assert not required_damping(between, HERE_ONLY, LIMITER, limits.force_limits.requirement.multiplier).certified
-    assert limits.guarantee.environments == "these ranges"
+    assert limits.guarantee.environments == RANGES
     assert limits.guarantee.forces == "also while they are limited, in this environment"
 
 

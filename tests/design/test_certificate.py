@@ -31,7 +31,7 @@ from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.result import HERE, NotProved, from_ratio
+from haptic_loop.design.result import ANY, HERE, NotProved, from_ratio
 from haptic_loop.design.robustness import ranges_around
 from haptic_loop.sim.scenario import load as scenario
 from tests.checks.random_loops import proofs
@@ -59,7 +59,7 @@ def test_loops_with_psi_are_proved_with_phi(psi):
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     design = spring_damper.design(loop)
     stored = Stored.of(loop, design.coupling, prove(loop, design.coupling, "any-environment", design.phi))
-    assert stored.certificate.guarantee == "this environment"
+    assert stored.certificate.guarantee == HERE
     assert set(stored.certificate.matrices) == {"P", "P_E"}
     assert verify(stored) == Verdict(True)
     least = prove(loop, design.coupling, "any-environment")  # `prove` finds the least Phi
@@ -236,7 +236,7 @@ def test_repaired_digests_do_not_forge_a_proof():
         "margin is": change(good.certificate, margin=2.0),
         "required is": change(good.certificate, required=(0.1, 0.1)),
         "available is": change(good.certificate, available=(2.0, 2.0)),
-        "does not guarantee": change(good.certificate, guarantee="any passive environment"),
+        "does not guarantee": change(good.certificate, guarantee=ANY),
         "carries no exact proof": change(good.certificate, proof="sampled"),
         "expected P": change(good.certificate, matrices={}),
         "the block has 9 states": change(good.certificate, matrices={"P": (("1",),)}),
@@ -283,7 +283,7 @@ def test_files_without_a_coupling_are_refused(tmp_path, content, message):
 
 
 def test_coefficients_above_1e12_are_refused():
-    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are sizes up to 1e\+12"):
+    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80.*sizes up to 1e\+12"):
         _InternalModelForm((), (((1e80, 0.0), (0.0, 1e80)),))
     with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
         _ComplianceForm((), (), ((),), ((-1e13,),))
@@ -529,7 +529,7 @@ def test_a_loop_with_a_long_delay_is_stored(tmp_path):
 
 @pytest.mark.parametrize("psi", [1001, 10**9, 2**70])
 def test_delays_beyond_1000_samples_are_refused(psi):
-    with pytest.raises(ValueError, match=rf"psi is \[{psi}, {psi}\], allowed are .* 0 to 1000"):
+    with pytest.raises(ValueError, match=rf"psi is \[{psi}, {psi}\].* 0 to 1000"):
         msgspec.structs.replace(PAIR, psi=(psi, psi))
     with pytest.raises(ValueError, match=rf"to \[{psi}, {psi}\] samples, expected 0 <= lo <= hi <= 1000"):
         DelayRange((1, 1), (psi, psi))

@@ -21,6 +21,7 @@ from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT, LimitedForces
 from haptic_loop.design.facts import KnownMotor, Limited, Switching, Walls, compose
 from haptic_loop.design.known_device import period_cost
+from haptic_loop.design.result import RANGES
 
 change = msgspec.structs.replace
 BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])
@@ -245,7 +246,7 @@ def test_facts_are_proved_at_every_vertex(names):
     assert all(member.network.walls == loop.environment.walls for member in loop.members())
     enough = change(loop, delta=(1.001 * least,))
     certificate = prove(enough, COUPLING, condition)
-    assert certificate.guarantee == "these ranges"
+    assert certificate.guarantee == RANGES
     assert {name for name in certificate.matrices if name[0] == "P"} == {"P", "P1", "P2"}
     assert verify(Stored.of(enough, COUPLING, certificate)).proved
     stiffer = change(enough, ranges=Ranges(masses={"tip": (0.04, 5.0)}))
@@ -260,7 +261,7 @@ def test_walls_with_ranges_are_guaranteed_for_ranges():
     assessment = assess(loop, COUPLING, ranges_samples=2)
     assert assessment.ranges.proved
     assert assessment.holds
-    assert assessment.guarantee.environments == "these ranges"
+    assert assessment.guarantee.environments == RANGES
     assert not assess(change(loop, delta=(1.2,)), COUPLING, ranges_samples=0).holds
 
 

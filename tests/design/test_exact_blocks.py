@@ -34,7 +34,7 @@ from haptic_loop.design.conditions import delayed_environment_demand
 from haptic_loop.design.coupling_file import Stored, digest, sealed
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.exact import _prove_positive_real, find_storage
-from haptic_loop.design.result import NotProved, from_ratio
+from haptic_loop.design.result import ANY, NotProved, from_ratio
 
 CLOSE = 1e-6  # relative distance from a limit, on either side
 change = msgspec.structs.replace
@@ -412,7 +412,7 @@ def test_proofs_serve_only_their_own_condition():
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # The size must not reveal an exchanged P.
     assert forged(loop, coupling, anywhere) is None
     assert forged(loop, coupling, anywhere, matrices=here.matrices) == NEGATIVE
-    assert "does not guarantee" in forged(loop, coupling, here, guarantee="any passive environment")
+    assert "does not guarantee" in forged(loop, coupling, here, guarantee=ANY)
     soft = change(loop, environment=to_ground(100.0))  # The block for this-environment depends on the spring.
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 

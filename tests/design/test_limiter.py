@@ -20,7 +20,7 @@ from haptic_loop.design.environments import LIMITER, LimitedForces
 from haptic_loop.design.frequency import hermitian, on_circle
 from haptic_loop.design.gain_search import LimiterLoop
 from haptic_loop.design.lmi import RESERVE
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import ANY, NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import InputError
@@ -270,9 +270,7 @@ def test_a_changed_storage_matrix_proves_nothing(stored):
 
 def test_any_environment_with_psi_covers_no_limiter():
     loop = msgspec.structs.replace(PAIR, psi=(1, 1))
-    some = Certificate(
-        "any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, {}, "", {}
-    )
+    some = Certificate("any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, ANY, "rational", {}, {}, "", {})
     assert limiter_rho(PAIR, some) == (0.0, 0.0)
     assert limiter_rho(loop, some) is None
 

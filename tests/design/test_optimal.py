@@ -30,7 +30,7 @@ from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.frequency import hermitian, on_circle
 from haptic_loop.design.optimal import _SETTLED, _BasisResult, design, design_with
 from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import RANGES, NotProved
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
 from haptic_loop.design.transparency import BAND_HZ, transparency
 from haptic_loop.sim.scenario import load
@@ -442,7 +442,7 @@ def test_range_couplings_are_proved_at_every_vertex():
     optimum = design(ranged, SMALLEST)
     assert optimum.proved
     assert len(optimum.certificate.matrices) == len(ranged.members())
-    assert optimum.certificate.guarantee == "these ranges"
+    assert optimum.certificate.guarantee == RANGES
     spread = robustness(loop, optimum.coupling)
     assert spread.certified
     for network in vertices(loop.environment).values():
@@ -732,7 +732,7 @@ def test_a_filter_multiplies_the_environments_force():
         ([], [[-2.0, 0.9, 0.0]], np.zeros((3, 1, 1)), "pairs have 3 entries"),
         ([0.5], [], np.zeros((1, 1, 1)), "R has shape"),
         ([], [], [[[np.nan]]], "R has an entry of nan"),
-        ([], [], [[[1e12]]], "allowed are numbers up to 1e"),
+        ([], [], [[[1e12]]], "numbers up to 1e"),
         ([], [], [[[-0.1]]], "expected g times the identity with g >= 0"),
         ([], [], [[[0.5, 0.1], [0.1, 0.5]]], "expected g times the identity"),
     ],

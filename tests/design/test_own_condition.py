@@ -20,7 +20,7 @@ from haptic_loop.design.coupling_file import Stored, filed, sealed
 from haptic_loop.design.environments import SWITCHING, SwitchingDelays
 from haptic_loop.design.facts import Fact
 from haptic_loop.design.files import InputError
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import ANY, HERE, RANGES, NotProved
 from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
@@ -105,7 +105,7 @@ def test_named_ranges_are_proved_at_every_vertex():
     assert own.ratio == pytest.approx(shipped.ratio, rel=1e-9)
     certificate = prove(loop, SOFT, Everywhere())
     assert len(certificate.matrices) == len(loop.members()) > 1
-    assert certificate.guarantee == "these ranges"
+    assert certificate.guarantee == RANGES
     assert verify(Stored.of(loop, SOFT, certificate), Everywhere()).proved
 
 
@@ -219,7 +219,7 @@ class Anywhere(Plain):
     name = "anywhere"
 
     def guarantee(self, loop):
-        return "any passive environment"
+        return ANY
 
 
 @pytest.mark.slow
@@ -229,7 +229,7 @@ def test_own_conditions_state_environments_and_limits():
     assert assess(PAIR, stiff, condition=own, limiter=False).guarantee.any_environment
     assert not needs["any-environment"].certified
     assert _covered_limits(PAIR, stiff, needs).less
-    assert assess(PAIR, stiff, limiter=False).guarantee.environments == "this environment"
+    assert assess(PAIR, stiff, limiter=False).guarantee.environments == HERE
     assert not _covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).less
 
 

@@ -31,7 +31,7 @@ from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.exact import Matrix
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import hermitian
-from haptic_loop.design.result import NotProved, switching_guarantee
+from haptic_loop.design.result import RANGES, NotProved, switching_guarantee
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.couplings import from_file
@@ -200,8 +200,8 @@ def test_files_with_impossible_ranges_are_refused(file, tmp_path, fields, messag
 
 # ranges of environments, whose members share one alpha
 
-RANGES = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
-RANGED = change(LOOP, ranges=RANGES)
+UNCERTAIN = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
+RANGED = change(LOOP, ranges=UNCERTAIN)
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def ranged() -> Certificate:
 
 def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
     """At the stored requirement the least eigenvalue by hand over 4000 frequencies is zero at the worst member only."""
-    assert (ranged.facts, ranged.guarantee, len(ranged.matrices)) == (("switching", "ranges"), "these ranges", 4)
+    assert (ranged.facts, ranged.guarantee, len(ranged.matrices)) == (("switching", "ranges"), RANGES, 4)
     save(Stored.of(RANGED, SOFT, ranged), tmp_path / "ranges.json")
     assert verify(load(tmp_path / "ranges.json")).proved
     forged = sealed(change(ranged, facts=("switching",)))
@@ -236,7 +236,7 @@ def test_switching_over_ranges_is_guaranteed_for_ranges(ranged):
     assessment = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
     assert assessment.holds
     assert (assessment.guarantee.environments, assessment.guarantee.facts) == (
-        "these ranges",
+        RANGES,
         ("switching", "ranges", "limiter"),
     )
     assert assessment.requirements["switching"].ratio < ranged.required[0] / 1.37  # in the nominal environment
@@ -251,7 +251,7 @@ def test_random_members_switch_without_growing_hands(ranged):
     links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(12, 2, 1, 3)))
     links[..., 1] = 0.0
     growing = {1.0: 0, 0.5: 0}
-    for member in inside(FIGURE_4, RANGES, 1, seed=4):
+    for member in inside(FIGURE_4, UNCERTAIN, 1, seed=4):
         for share in growing:
             scenario = scenario_of().replace(
                 theta=(1, 1),
@@ -431,8 +431,8 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
     (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve exists
-    covered = "a force that is held through 1 missed answer is covered by the file's proof"
-    assert first.remarks() == [f"{covered} while forces stay below their limits"]
+    (remark,) = first.remarks()
+    assert "1 missed answer " in remark
     late = change(LOOP, theta=(2, 2), lam=(2, 2), varying_delay=DelayRange((2, 2), (2, 2)))
     save(Stored.of(late, SOFT, prove(late, SOFT, "this-environment")), tmp_path / "two.json")
     (early,) = certified_couplings(scenario, "I", str(tmp_path / "two.json"), None, 1, spare=0)

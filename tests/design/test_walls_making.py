@@ -19,7 +19,7 @@ from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import find_storage
-from haptic_loop.design.result import MAKING, NotProved
+from haptic_loop.design.result import HERE, MAKING, NotProved
 
 change = msgspec.structs.replace
 
@@ -312,7 +312,7 @@ def test_couplings_may_be_stiffer_than_any_environment_allows():
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, gap=0.005),)))
     coupling = SpringDamper([1300.0], [0.45])
     assert any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).ratio > 1.2
-    assert prove(loop, coupling, "this-environment").guarantee == "this environment"
+    assert prove(loop, coupling, "this-environment").guarantee == HERE
 
 
 # Hands that touch and leave a wall, simulated exactly.

@@ -18,7 +18,7 @@ from haptic_loop.design.assessment import SearchFigures, check_ranges
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.program import Options
-from haptic_loop.design.result import Design
+from haptic_loop.design.result import HERE, Design
 from haptic_loop.design.worst_member import search
 from haptic_loop.sim import scenario
 from haptic_loop.sim.scenario import SCENARIOS
@@ -203,7 +203,7 @@ def test_couplings_violated_between_vertices_are_stored_without_ranges(known, tm
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
     assert store(RANGED, design, tmp_path / "c.json").proof == "rational"
     stored = load(tmp_path / "c.json")
-    assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
+    assert (stored.loop.ranges, stored.certificate.guarantee) == (None, HERE)
 
 
 @pytest.mark.slow

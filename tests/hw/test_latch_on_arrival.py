@@ -13,6 +13,7 @@ from haptic_loop.cli.bridge import _overlong_tick
 from haptic_loop.cli.bridge import main as bridge
 from haptic_loop.cli.replay import main as replay
 from haptic_loop.design.certificate import required_damping
+from haptic_loop.design.result import HERE
 from haptic_loop.hw.control import certified_couplings, timed
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.monitor import Ages, LinkSettings
@@ -150,7 +151,7 @@ def test_sessions_with_arrival_latching_replay_bit_for_bit(tmp_path, capsys):
     report = json.loads(file.read_text())
     assert report["assessment"]["loop"]["theta"] == [0, 0]
     assert report["assessment"]["loop"]["latency_s"][0] == pytest.approx([30e-6, 230e-6])
-    assert report["assessment"]["guarantee"]["environments"] == "this environment"
+    assert report["assessment"]["guarantee"]["environments"] == HERE
     assert report["link"]["age_us"]["p50"] == pytest.approx(TAU)
     said = " ".join(capsys.readouterr().out.split())
     assert "forces that act 30 to 230 us after their tick" in said

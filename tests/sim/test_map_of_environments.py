@@ -13,6 +13,7 @@ from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
+from haptic_loop.design.result import HERE
 from haptic_loop.models.scene import crowds, variants
 from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.limit_cycles import HeldDevices
@@ -144,7 +145,7 @@ def test_maps_of_optimal_couplings_report_their_guarantee(tmp_path, capsys):
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["axes"] == "environment"
     assert report["kind"] == "optimal"
-    assert report["assessment"]["guarantee"]["environments"] == "this environment"
+    assert report["assessment"]["guarantee"]["environments"] == HERE
     assert report["assessment"]["requirements"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["this-environment", "any-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0

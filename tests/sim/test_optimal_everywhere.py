@@ -24,6 +24,7 @@ from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
+from haptic_loop.design.result import HERE
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import SafetyLimits, Stage
@@ -96,7 +97,7 @@ def test_run_and_validate_take_couplings_of_each_form(file_of, form, tmp_path):
     options = [*common, "--duration", "0.2", "--out", str(tmp_path)]
     assert run.main(options) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["assessment"]["guarantee"]["environments"] == "this environment"
+    assert report["assessment"]["guarantee"]["environments"] == HERE
     assert report["robustness"]["percent"] == 10
     assert (report["assessment"]["force_limits"]["rho"] is not None) == (form == "filter")
     assert validate.main([*common, "--humans", "6", "--duration", "0.1", "--out", str(tmp_path)]) == 0
