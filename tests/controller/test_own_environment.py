@@ -67,7 +67,7 @@ def test_elements_become_springs_and_walls():
     assert made == msgspec.json.decode(msgspec.json.encode(made), type=Network)
     with pytest.raises(ValueError, match="element int: it is 3, expected a class whose parts"):
         _parts_of(3)
-    with pytest.raises(ValueError, match="the network has 8 walls, allowed are 6"):
+    with pytest.raises(ValueError, match=r"the network has 8 walls.*6"):
         Network(("a",), elements=(Hardening(("a", "ground"), 100.0, 2e-3),) * 4)
 
 

@@ -26,7 +26,7 @@ from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.program import Options
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import ANY, HERE, RANGES, NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
 from tests.evaluate import decisive, safe_with
 
@@ -176,7 +176,7 @@ def test_reports_say_that_half_the_vertices_are_proved():
 
 
 def test_the_number_of_parameters_is_limited():
-    with pytest.raises(ValueError, match="ranges have 65 pairs of ends, allowed are 64: leave out some"):
+    with pytest.raises(ValueError, match=r"ranges have 65 pairs of ends.*64: leave out some"):
         members(*chain(65))
 
 
@@ -278,14 +278,14 @@ def test_wide_ranges_have_a_proved_design():
     ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
     design = optimal.design(change(LOOP, ranges=ranges), SMALLEST)
     assert design.proved
-    assert design.certificate.guarantee == "these ranges"
+    assert design.certificate.guarantee == RANGES
 
 
 # the proof
 
 
 def test_every_vertex_is_proved_and_stored(stored):
-    assert stored.certificate.guarantee == "these ranges"
+    assert stored.certificate.guarantee == RANGES
     assert set(stored.certificate.matrices) == {"P", "P1", "P2", "P3"}
     assert verify(stored).proved
 
@@ -333,10 +333,10 @@ def test_violating_samples_leave_ranges_unproved(robust):
 @pytest.mark.slow
 def test_spring_dampers_may_be_proved_for_ranges():
     soft, stiff = (SpringDamper((K,), (0.52,)) for K in (550.0, 1500.0))
-    assert prove(LOOP, soft, "any-environment").guarantee == "any passive environment"
+    assert prove(LOOP, soft, "any-environment").guarantee == ANY
     check = check_ranges(LOOP, stiff, samples=8)
     assert check.proved
-    assert check.certificate.guarantee == "these ranges"
+    assert check.certificate.guarantee == RANGES
 
 
 def test_files_without_ranges_keep_their_digest():
@@ -364,7 +364,7 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
     code, design = reported(design_main, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common)
     assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (
         0,
-        "these ranges",
+        RANGES,
         3,
     )
     alone, whole = design["price"]
@@ -372,10 +372,10 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
     assert alone["violated"] >= 1
     # A design also weighs each motion's relative error, which with one basis cost the nominal design 0.014 dB.
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
-    assert load(file).certificate.guarantee == "these ranges"
+    assert load(file).certificate.guarantee == RANGES
 
     code, checked = reported(check_main, str(file), "--json", str(report))
-    assert (code, checked["guarantee"], checked["vertices"]) == (0, "these ranges", 3)
+    assert (code, checked["guarantee"], checked["vertices"]) == (0, RANGES, 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
     at_vertex = [
@@ -390,7 +390,7 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
         "--no-plot",
     ]
     code, run = reported(run_main, *at_vertex, *out)
-    assert (code, safe_with(run)) == (0, "these ranges")
+    assert (code, safe_with(run)) == (0, RANGES)
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert not np.load(tmp_path / "out" / "trace.npz")["f"].any()  # The device touches nothing at this vertex.
 
@@ -407,7 +407,7 @@ def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path, c
         return code, json.loads(report.read_text())
 
     code, audit = reported(audit_main, "--coupling", str(file), *out)
-    assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, "these ranges", True)
+    assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, RANGES, True)
 
     quick = ["--humans", "6", "--engine", "exact", "--duration", "0", "--no-plot"]
     code, validated = reported(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
@@ -422,7 +422,7 @@ def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
     stiff = ["--K", "2150", "--B", "1.0"]
     assert audit_main(["--scenario", str(scenario_file), *stiff, "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
-    assert safe_with(outcome) == "this environment"
+    assert safe_with(outcome) == HERE
     assert decisive(outcome)["certified"]
 
 
@@ -430,7 +430,7 @@ def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
 def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp_path, capsys):
     options = ["--condition", "this-environment", "--scenario", str(scenario_file)]
     assert design_main([*options, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 0
-    assert safe_with(json.loads(capsys.readouterr().out)) == "these ranges"
+    assert safe_with(json.loads(capsys.readouterr().out)) == RANGES
     stored = load(tmp_path / "s.json")
     assert verify(stored).proved
     V = 1 / (np.array(stored.coupling.K) + np.array(stored.coupling.B) * (1 - 1 / Z)[:, None] / T)
@@ -445,7 +445,7 @@ def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--vertex", "4"], "--vertex is 4, allowed are 0 to 3"),
+        (["--vertex", "4"], "--vertex is 4.*0 to 3"),
         (["--vertex", "x"], "--vertex is 'x', expected a whole number"),
         (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no ranges"),
     ],

@@ -299,7 +299,7 @@ def test_an_active_environment_is_refused():
 
 
 def test_an_unknown_condition_is_refused():
-    with pytest.raises(ValueError, match="condition is 'both', allowed are any-environment, this-environment"):
+    with pytest.raises(ValueError, match=r"condition is 'both'.*any-environment, this-environment"):
         design(pair(), "both")
 
 
@@ -335,9 +335,9 @@ def test_designs_that_take_minutes_are_refused_early():
     names = tuple(f"c{i}" for i in range(49))
     springs = tuple(Spring((name, "ground"), 300.0) for name in names)
     many = Loop(T, *[(0,) * 49] * 3, (1.0,) * 49, Network(names, springs))
-    with pytest.raises(DesignFailed, match="49 channels, allowed are 48"):
+    with pytest.raises(DesignFailed, match=r"49 channels.*48"):
         spring_damper.design_with(many, "any-environment")
-    with pytest.raises(DesignFailed, match="49 channels, allowed are 32 for a spring-damper by the limiter"):
+    with pytest.raises(DesignFailed, match=r"49 channels.*32 for a spring-damper by the limiter"):
         spring_damper.design_with(many, "this-environment", limiter=True)
     four = Network(names[:4], springs[:4])
     late = Loop(T, (0,) * 4, (100,) * 4, (0,) * 4, (1.0,) * 4, four)

@@ -198,11 +198,11 @@ def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
         np.testing.assert_array_equal(getattr(stored, name), getattr(expected, name))
     assert not any(tmp_path.iterdir())  # the trace's file has no name
     monkeypatch.setattr(loop, "_free_memory", lambda: 200 * ticks)
-    with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .* allowed are 0.3 s"):
+    with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .*0.3 s"):
         run(simulation, "exact")
     monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
     monkeypatch.setattr(loop.shutil, "disk_usage", lambda place: SimpleNamespace(free=1000))
-    with pytest.raises(InputError, match=r"duration: .* GiB of .* are free: allowed are"):
+    with pytest.raises(InputError, match=r"duration: .* GiB of .* are free:"):
         run(simulation, "exact")
 
 

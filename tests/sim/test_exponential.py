@@ -286,9 +286,9 @@ def test_engines_default_to_the_scenes_integrator_and_substeps(simulation):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda a: make_engine(a, "drake"), "engine is 'drake', allowed are mujoco, exact"),
-        (lambda a: make_engine(a, "mujoco", "Euler2"), f"integrator is 'Euler2', allowed are {', '.join(INTEGRATORS)}"),
-        (lambda a: make_engine(a, "mujoco", EXPONENTIAL, 0), "substeps is 0, allowed are whole numbers from 1"),
+        (lambda a: make_engine(a, "drake"), "engine is 'drake'.*mujoco, exact"),
+        (lambda a: make_engine(a, "mujoco", "Euler2"), f"integrator is 'Euler2'.*{', '.join(INTEGRATORS)}"),
+        (lambda a: make_engine(a, "mujoco", EXPONENTIAL, 0), "substeps is 0.*whole numbers from 1"),
         (
             lambda a: make_engine(assemble(RUBBING, PUBLISHED["I"]), "exact"),
             "have Coulomb friction, which the exact engine",
@@ -385,7 +385,7 @@ def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
     """After two runs the estimate for all is 512 steps of 4 evaluations in 100 ticks, over 2e5, so no third begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
-    words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
+    words = r"requires RK4 with about 256 substeps, 0 million evaluations;.*0\.2 million"
     with pytest.raises(InputError, match=words):
         compare_engines(assemble(RUBBING, PUBLISHED["I"]), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
     assert moved.count((100, 100)) == 2

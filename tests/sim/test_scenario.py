@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from messages import says
 from shared import FIGURE_4
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -22,30 +23,30 @@ TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 BAD = [
     ("theta = [1, 2]", "theta = [1, 1.5]", "theta #2 = 1.5: expected `int`, got `float`"),
     ("theta = [1, 2]", "theta = [1]", "theta has 1 entries, but the environment has 2 contacts"),
-    ("theta = [1, 2]", "theta = [1, -1]", "theta #2 is -1, allowed are 0 to 1000 samples"),
+    ("theta = [1, 2]", "theta = [1, -1]", "theta #2 is -1 .. 0 to 1000 samples"),
     ("theta = [1, 2]", "theta = [1, true]", "theta #2 = True: expected `int`"),
     ("psi = [0, 0]", "psi = [0, 0, 0]", "psi has 3 entries"),
-    ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam #1 is 2, allowed are 0 to theta + psi = 1 samples"),
-    ("T = 1.2e-3", "T = 1.2", "T is 1.2, allowed are 1e-06 to 0.1 s"),
+    ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam #1 is 2 .. 0 to theta + psi = 1 samples"),
+    ("T = 1.2e-3", "T = 1.2", "T is 1.2 .. 1e-06 to 0.1 s"),
     ("T = 1.2e-3", "T = nan", "T is nan"),
     ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
     ("T = 1.2e-3", "T == 1", "not valid TOML"),
     ("name = ", "nam = ", "unknown field `nam` (did you mean `name`?)"),
-    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06, allowed are 1e-06 to 1000 kg"),
+    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06 .. 1e-06 to 1000 kg"),
     ("motor_mass = 0.06 ", "motor_mas = 0.06", "unknown field `motor_mas` (did you mean `motor_mass`?)"),
-    ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m, allowed are values in (0, damping = 1.37]"),
-    ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft', allowed are 'compliant'"),
+    ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m .. values in (0, damping = 1.37]"),
+    ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft' .. 'compliant'"),
     (
         "damping = 1.37 ",
         "damping = 1.37\nfriction = 0.2\nfriction_max = 0.1",
-        "device #1: friction_max is 0.1, allowed are 0.2 to 1000 N",
+        "device #1: friction_max is 0.1 .. 0.2 to 1000 N",
     ),
-    ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000, allowed are 0 to 1000 kg"),
+    ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000 .. 0 to 1000 kg"),
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
     ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed in"),
     ("mass = 1.0 }", "mas = 1.0 }", "masses lists 'mas', which no spring or wall reaches"),
-    ("channel = 1", "channel = 3", "tap.channel is 3, allowed are 1 to 2"),
+    ("channel = 1", "channel = 3", "tap.channel is 3 .. 1 to 2"),
     ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
     ("duration = 15.0", "duration = 0.0", "duration is 0"),
 ]
@@ -62,7 +63,7 @@ def test_bad_scenarios_give_one_line(old, new, message):
     with pytest.raises(InputError) as caught:
         parse(TEXT.replace(old, new, 1), "mine.toml")
     assert str(caught.value).startswith("mine.toml: ")
-    assert message in str(caught.value)
+    assert says(caught.value, message)
     assert "\n" not in str(caught.value)
 
 
@@ -142,7 +143,7 @@ def test_replaced_fields_are_checked():
     assert scenario.replace(delta=(2.0, 0.8)).delta == (2.0, 0.8)
     for change, message in [
         ({"theta": (1, 2, 3)}, "theta has 3 entries"),
-        ({"delta": (1.0, -1.0)}, r"delta #2 is -1, allowed are 0 to 10000 N s/m"),
+        ({"delta": (1.0, -1.0)}, r"delta #2 is -1.*0 to 10000 N s/m"),
         ({"delta": (1.0,)}, "delta has 1 entries for 2 devices"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -183,14 +184,14 @@ def test_scripts_may_use_lists_arrays_and_integers():
         ({"device": (1, 2)}, "device #1 = 1: expected `object`, got `int`"),
         ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
         ({"delta": (1.0, "x")}, "delta #2 = 'x': expected `float`, got `str`"),
-        ({"delta": (float("nan"), 1.0)}, "delta #1 is nan, allowed are 0 to 10000 N s/m"),
+        ({"delta": (float("nan"), 1.0)}, "delta #1 is nan .. 0 to 10000 N s/m"),
         ({"thta": (1, 1)}, "unknown field `thta` (did you mean `theta`?)"),
     ],
 )
 def test_replacing_is_as_strict_as_a_file(change, message):
     with pytest.raises(InputError) as caught:
         load().replace(**change)
-    assert message in str(caught.value)
+    assert says(caught.value, message)
 
 
 def test_damping_and_other_fields_are_replaced_together():
@@ -337,18 +338,18 @@ springs = [{springs}]
         return parse(text.format(delays=[0] * n, contacts=contacts, springs=springs)).channels
 
     assert channels(16) == 16
-    with pytest.raises(InputError, match=r"environment\.contacts has 50 entries, allowed are 1 to 32"):
+    with pytest.raises(InputError, match=r"environment\.contacts has 50 entries.*1 to 32"):
         channels(50)
 
 
 def test_too_long_hands_are_refused():
     one = Link(mass=0.3, damping=3.0, stiffness=200.0)
     assert len(Human(links=(one,) * 500).links) == 500
-    with pytest.raises(ValueError, match=r"links has 501 entries, allowed are 1 to 500"):
+    with pytest.raises(ValueError, match=r"links has 501 entries.*1 to 500"):
         Human(links=(one,) * 501)
     links = ", ".join(["{ mass = 0.3, damping = 3.0, stiffness = 200.0 }"] * 501)
     human = f"{{ links = [{links}] }}"
-    with pytest.raises(InputError, match=r"human.*links has 501 entries, allowed are 1 to 500"):
+    with pytest.raises(InputError, match=r"human.*links has 501 entries.*1 to 500"):
         parse(FALCON.format(device='"omega.3"').replace("human = [", f"human = [{human},", 1))
 
 
@@ -401,16 +402,16 @@ def test_measured_friction_replaces_the_published_bound():
 def test_incomplete_or_unknown_devices_are_refused(device, message):
     with pytest.raises(InputError) as caught:
         parse(FALCON.format(device=device))
-    assert message in str(caught.value)
+    assert says(caught.value, message)
 
 
 def test_too_many_delay_states_are_refused():
     """The message has the delays of every channel, because a single number on the command line counts for each."""
-    words = r"^theta \[999, 999\] and psi \[0, 0\] .* 1998 samples in all, allowed are 1000: each .* state, .*about 8 s"
+    words = r"^theta \[999, 999\] and psi \[0, 0\] .* 1998 samples in all.*1000: each .* state, .*about 8 s"
     with pytest.raises(ValueError, match=words):
         load().replace(theta=(999, 999))
 
 
 def test_traces_beyond_memory_are_refused_early():
-    with pytest.raises(InputError, match=r"duration: 1e\+06 s need .* GiB of .*, .* are free: allowed are .* s"):
+    with pytest.raises(InputError, match=r"duration: 1e\+06 s need .* GiB of .*, .* are free:.* s"):
         run(assemble(load().replace(duration=1e6), NoCoupling()))

@@ -454,13 +454,13 @@ def test_adversaries_contradict_certificates_only():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
+        (["--humans", "0"], "--humans is 0.*1 to 1000000"),
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
-        (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both"),
-        (["--links", "9"], "--links is '9', allowed are"),
-        (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
-        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
-        (["--duration", "-1"], "--duration is -1, allowed are 0 and 0.0048 to 100000 s"),
+        (["--engine", "drake"], "--engine is 'drake'.*exact, mujoco, both"),
+        (["--links", "9"], "--links is '9'"),
+        (["--shards", "0"], "--shards is 0.*1 to 256"),
+        (["--generations", "0"], "--generations is 0.*1 to 10000"),
+        (["--duration", "-1"], "--duration is -1.*0 and 0.0048 to 100000 s"),
         (["--seed", "-1"], "--seed is -1"),
         (["--case", "none", "--coupling", "published"], "with --case none"),
     ],
@@ -473,22 +473,22 @@ def test_bad_options_are_refused(options, message, tmp_path):
 def test_a_negative_range_is_refused(tmp_path):
     text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text() + "\n[population]\nmass = [-1.0, 3.0]\n"
     (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(InputError, match=r"mass #1 is -1, allowed are"):
+    with pytest.raises(InputError, match=r"mass #1 is -1"):
         main(["--scenario", str(tmp_path / "s.toml")])
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[[human]]\nlinks = [{mass = -1.0, damping = 0, stiffness = 0}]\n", "mass is -1, allowed are"),
+        ("[[human]]\nlinks = [{mass = -1.0, damping = 0, stiffness = 0}]\n", "mass is -1"),
         ("[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n", "has 1 .* tables, expected 2"),
         ("[[human]]\nlinks = []\n", "length >= 1"),
         (
             TWO + "[[person]]\nholds = [1, 3]\nmass = 1.0\ndamping = 0\nstiffness = 0\n",
-            "has device 3, allowed are 1 to 2",
+            "has device 3.*1 to 2",
         ),
         (TWO + "[[person]]\nholds = [1]\nmass = 1.0\ndamping = 0\nstiffness = 0\n", "two or more different devices"),
-        (TWO + "[[person]]\nholds = [1, 2]\nmass = 0\ndamping = 0\nstiffness = 0\n", "mass is 0, allowed are"),
+        (TWO + "[[person]]\nholds = [1, 2]\nmass = 0\ndamping = 0\nstiffness = 0\n", "mass is 0"),
         ("[[people]]\n", "unknown field `people`"),
         ("[[human", "not valid TOML"),
     ],
