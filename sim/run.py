@@ -2,8 +2,8 @@
 
     trace = run(assemble(scenario, coupling), "mujoco")
 
-A tick samples the positions, computes the forces, limits and holds them, and advances the plant by one period: see
-controller.tick for the order of these steps, and sim.engines for the last step.
+A tick samples the positions, computes, limits and holds the forces, and advances the plant by one period. The module
+controller.tick explains the order of these steps, and sim.engines the last step.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
 When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities (in a world it
-restarts from rest). The new process, F with states z, starts at the equilibrium for these positions x without contact,
-z = A z + B x: its delay lines hold the static force, F(1) x if no limiter acts. The force changes to that of the new
-coupling, and the motion of the environment's masses is lost.
+restarts from rest). The new process, F with states z, starts at the equilibrium z = A z + B x for these positions x,
+without contact. Its delay lines hold the static force, which is F(1) x if no limiter acts. So the force changes to that
+of the new coupling, and the motion of the environment's masses is lost.
 
 The mouse is a hand: a spring from the handle to the dragged point, and a damper from the handle to the ground. It is
 part of the exact plant and passive, so a certificate for every passive human covers it. Only the end of the spring
