@@ -74,8 +74,7 @@ RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 # Steps of iterations that converge. Brackets hold the largest number in the optimal and the default designs of cases I
 # and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) ----------------------------------------------
 
-#: Newton steps to the centre of a barrier (9 centrings took all 60 and returned the last point), and of the primal-dual
-#: method (two runs took all 60 because of rounding).
+#: Steps to a point of a barrier's path (7), and of the primal-dual method (two runs took all 60 because of rounding).
 CENTRING_STEPS, CONE_STEPS = 60, 60
 #: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further pass
 #: divides the condition number by as much. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after

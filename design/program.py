@@ -379,24 +379,26 @@ class Problem:
     def objective(self) -> tuple[Array, Array, Array]:
         """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness, size of R.
 
-        Each device's row of R is a separate least-squares problem, which is reduced to its triangular factor.
+        Each device's row of R is a separate least-squares problem, which is reduced to its triangular factor. They
+        share only g, so that A has few more rows than unknowns.
         """
         parts = [part for case in self.cases if case.weight for part in self._weighed(case)]
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
         for i in range(self.cases[0].E.inputs):
             mine = np.concatenate([[0], 1 + np.flatnonzero(row_of == i)])
-            stacked = np.vstack([np.zeros((0, mine.size + 1)), *(self._force_rows(*part, i, mine) for part in parts)])
+            small = _SMALL * np.eye(mine.size, mine.size + 1)[1:]
+            stacked = np.vstack([*(self._force_rows(*part, i, mine) for part in parts), small])
             R = np.asarray(np.linalg.qr(stacked, mode="r"))
             slope = np.zeros((len(R), self.unknowns))
             slope[:, mine] = R[:, :-1]
             rows.append(slope)
             right.append(R[:, -1])
-        static = np.zeros((1, self.unknowns))
-        static[0, 0] = held = self.heavier * static_weight(self.cases[0].loop)
+        held = self.heavier * static_weight(self.cases[0].loop)
+        of_g = np.zeros((2, self.unknowns))
+        of_g[:, 0] = held, _SMALL
         cost = np.zeros(self.unknowns)
         cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
-        small = _SMALL * np.eye(self.span.unknowns, self.unknowns)
-        return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
+        return np.vstack([*rows, of_g]), np.concatenate([*right, [held, 0.0]]), cost
 
     def _weighed(self, case: Case) -> list[tuple[Case, Array, Complex, Complex]]:
         """Return parts (case, w, L, target L) of the objective |F L - target L|^2.
@@ -560,8 +562,6 @@ class Problem:
         pairs, imposed = self.pairs, [self.grid(*pair) for pair in self.pairs]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
-        R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
-        A, b = R[:, :-1], R[:, -1]
         nothing = float(b @ b) + float(c.any())  # objective of zero force, whose relative mismatch is 1
         # With one constraint per environment, the caller scales the forces down.
         demanding = any(len(case.constraints) > 1 for case in self.cases)
