@@ -507,7 +507,10 @@ class ForceFilter(ReadOnly, Coupling):
             raise ValueError("the linear model inside the coupling cannot include the walls of the environment")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
-        return self.filter(environment.T) @ environment
+        F = self.filter(environment.T) @ environment
+        if F.is_exact:
+            return F
+        return F.with_response(lambda z: self.around(Sampled.of(environment, z[None])).G[0])
 
     def form(self) -> _ForceFilterForm:
         poles, pairs = tuple(self.poles.tolist()), tuple((b1, b2) for b1, b2 in self.pairs.tolist())

@@ -186,6 +186,8 @@ class Lti(ReadOnly):
         triangular A, or if the sum is inaccurate, it is evaluated by back substitution in the complex Schur form of A.
         """
         z = np.asarray(z, dtype=np.complex128)
+        if response := self.__dict__.get("_response"):
+            return response(z.ravel()).reshape(*z.shape, self.outputs, self.inputs)
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
             one = np.eye(self.order)
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
@@ -281,6 +283,12 @@ class Lti(ReadOnly):
                 return None
         seen = (np.abs(weights).reshape(p, m, taps) > _UNSEEN * size[:, None]).any(axis=(0, 1))
         return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
+
+    def with_response(self, response: Callable[[Complex], Complex]) -> Lti:
+        """Return the system with a faster `at` for points (k,). G @ H uses it if H has one."""
+        system = Lti(self.A, self.B, self.C, self.D, self.T)
+        system.__dict__["_response"] = response
+        return system
 
     def at_rest(self, x: Array) -> Array:
         """Return the state s = A s + B x for constant inputs x; of several solutions, the one of least norm."""
@@ -381,6 +389,8 @@ class Lti(ReadOnly):
         A = _block([[other.A, zero], [times(B, other.C), self.A]])
         C = _block([[times(D, other.C), self.C]])
         series = Lti(A, _block([[other.B], [times(B, other.D)]]), C, times(D, other.D), T)
+        if "_response" in other.__dict__:
+            return series.with_response(lambda z: self.at(z) @ other.at(z))
 
         def rest() -> tuple[Array, Array]:
             (own, R), (static, S) = self._rest, other._rest

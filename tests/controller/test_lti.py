@@ -274,7 +274,10 @@ def test_chains_of_slow_poles_keep_their_digits():
     chain = ForceFilter(1 - 0.5 * 1.35 ** -np.arange(20), [[-1.99, 0.992]] * 4, weights[:, None, None])
     z = np.exp(1j * np.geomspace(1e-5, np.pi, 100))
     product = chain.around(Sampled.of(oscillator, z[None])).G[0]
-    np.testing.assert_allclose(chain.around(oscillator).at(z), product, rtol=0, atol=2e-12 * np.abs(product).max())
+    series = chain.around(oscillator)
+    states = Lti(series.A, series.B, series.C, series.D, series.T)
+    for block in (series, states, Lti.constant([[1.0]], 1e-3) @ series):
+        np.testing.assert_allclose(block.at(z), product, rtol=0, atol=2e-12 * np.abs(product).max())
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 30])
