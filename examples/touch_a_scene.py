@@ -60,7 +60,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
         shell = Shell(coupling.compliance(T), start=START_J)
         mass, stiffness = 0.25 + rng.uniform(0.05, 0.5, 2), rng.uniform(50.0, 500.0, 2)
         x, v, aim = np.zeros(2), 0.3 * rng.normal(size=2), 0.03 * rng.normal(size=2)
-        given = most = 0.0
+        received = most = 0.0
         line = [np.zeros(2)] * (max(scenario.theta) + 1)
         rotation = np.sqrt(stiffness / mass) * T  # [rad] phase of a hand's oscillation in a tick
         jump = 0.0  # [N] largest change of a force from tick to tick in the last fifth of the run
@@ -84,8 +84,8 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
             v = speed * np.cos(rotation) - swing * np.sqrt(stiffness / mass) * np.sin(rotation)
             dx = x - before
             v = v - np.array(scenario.delta) / mass * dx  # the damping dissipates at least delta dx^2/T
-            given += -(f @ dx) - (np.array(scenario.delta) / T * dx**2).sum()
-            most, peak = max(most, given), max(peak, float(np.abs(f).max()))
+            received += -(f @ dx) - (np.array(scenario.delta) / T * dx**2).sum()
+            most, peak = max(most, received), max(peak, float(np.abs(f).max()))
         limited += int(shell.limited[0])
         grown += most > START_J + port.released
         shaking += jump > 0.1 * limit

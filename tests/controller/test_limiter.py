@@ -202,12 +202,12 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
         springs = tuple(Spring(s.between, s.stiffness * (1 + k / 9), s.damping) for s in FIGURE_4.springs)
         loop = loop_of(Network(FIGURE_4.contacts, springs, FIGURE_4.masses, some), (0, 1), (0, 0))
         laws.append(loop.law(STIFF, (3.0 + k, 1.5), (5.0, 2.0)) if limited else loop.law(STIFF))
-    order, made = laws[0].open.order, laws[0].together(laws)
+    order, stack = laws[0].open.order, laws[0].together(laws)
     for before in 3e-3 * np.random.default_rng(0).normal(size=(40, order + 2, 6)):
         if walls:
             before[order - walls : order] = np.abs(before[order - walls : order])  # depths
         together, alone = np.empty((order + 2, 6)), np.empty((order + 2, 1))
-        made(before, together)
+        stack(before, together)
         for k, law in enumerate(laws):
             law.transition()(np.ascontiguousarray(before[:, k : k + 1]), alone)
             np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-9, atol=1e-9)

@@ -237,13 +237,13 @@ def at_rest(G):
 def test_exact_blocks_at_rest_combine_their_parts(blocks):
     G, H = map(exact, blocks)
     late = hstack(G, delay((1, 2), G.T)) @ Lti.diag(H, 2 * H).rows([0, 3, 1, 2])
-    for whole in (G, G @ H, delay((2, 0), G.T) @ G.feedback(H), G @ np.array(H.D), late):
-        static, R = whole.split_at_one()
-        assert (static == np.array(at_rest(whole), dtype=object)).all()
-        assert (whole.dc() == static).all()
+    for block in (G, G @ H, delay((2, 0), G.T) @ G.feedback(H), G @ np.array(H.D), late):
+        static, R = block.split_at_one()
+        assert (static == np.array(at_rest(block), dtype=object)).all()
+        assert (block.dc() == static).all()
         # (z - 1) R = G - G(1) holds if R.C (A - I) = C, which needs no division
-        assert (times(R.C, R.A) - R.C == whole.C).all()
-        assert (R.B == whole.B).all()
+        assert (times(R.C, R.A) - R.C == block.C).all()
+        assert (R.B == block.B).all()
         assert not R.D.any()
 
 

@@ -60,11 +60,11 @@ def test_inertance_is_stored_only_if_given():
 
 
 def test_elements_become_springs_and_walls():
-    made = Network(("a",), (Spring(("a", "ground"), 5.0),), elements=(Hardening(("a", "ground"), 100.0, 2e-3),))
-    assert [spring.stiffness for spring in made.springs] == [5.0, 100.0]
-    assert [wall.between for wall in made.walls] == [("a", "ground"), ("ground", "a")]
-    assert made.elements == ()
-    assert made == msgspec.json.decode(msgspec.json.encode(made), type=Network)
+    network = Network(("a",), (Spring(("a", "ground"), 5.0),), elements=(Hardening(("a", "ground"), 100.0, 2e-3),))
+    assert [spring.stiffness for spring in network.springs] == [5.0, 100.0]
+    assert [wall.between for wall in network.walls] == [("a", "ground"), ("ground", "a")]
+    assert network.elements == ()
+    assert network == msgspec.json.decode(msgspec.json.encode(network), type=Network)
     with pytest.raises(ValueError, match="element int: it is 3, expected a class whose parts"):
         _parts_of(3)
     with pytest.raises(ValueError, match=r"the network has 8 walls.*6"):
@@ -77,8 +77,8 @@ def test_a_block_equals_the_network_of_its_numbers():
     alone = Network(INERT.contacts, block=Block.of(E))
     np.testing.assert_allclose(environment(alone, T).at(SQUARE), E.at(SQUARE), rtol=2e-6)
     spring = (Spring(("a", "b"), 70.0, 0.2),)
-    beside, whole = (msgspec.structs.replace(n, springs=(*n.springs, *spring)) for n in (alone, INERT))
-    np.testing.assert_allclose(beside.E(T).at(SQUARE), whole.E(T).at(SQUARE), rtol=2e-6)
+    beside, full = (msgspec.structs.replace(n, springs=(*n.springs, *spring)) for n in (alone, INERT))
+    np.testing.assert_allclose(beside.E(T).at(SQUARE), full.E(T).at(SQUARE), rtol=2e-6)
     exact = alone.E(rational(T))
     assert all(rational(a) == b for a, b in zip(E.A.ravel(), exact.A.ravel(), strict=True))
     with pytest.raises(ValueError, match=r"block: its numbers are for T = 0.001 s, the loop has 0.002 s"):
@@ -115,19 +115,19 @@ def resonance(width: float, angle: float, size: float = 1.5, floor: float = 500.
 def test_no_narrow_resonance_hides_from_passivity(width):
     """A block is accepted exactly if He [E/(1 - 1/z)] = He H is positive on a fine sweep around the resonance."""
     w = 1.2 + np.concatenate([width * np.linspace(-50, 50, 4001), np.linspace(-1.2, 1.9, 2001)])
-    seen = set()
+    verdicts = set()
     for size, angle in ((1.5, 1.536), (1.5, 1.6), (1.0, 0.0), (30 * width, 1.6), (200 * width, 3.0), (400 * width, 2)):
         p, r = (1 - width) * np.exp(1.2j), size * np.exp(1j * angle)
         z = np.exp(1j * w)
         power = (500 + r / (1 - p / z) + r.conjugate() / (1 - p.conjugate() / z)).real.min()
         assert abs(power) > 1
-        seen.add(passive := power > 0)
+        verdicts.add(passive := power > 0)
         if passive:
             Block.of(resonance(width, angle, size))
         else:
             with pytest.raises(ValueError, match=r"not passive, it generates energy at 19[01]"):
                 Block.of(resonance(width, angle, size))
-    assert seen == {True, False}
+    assert verdicts == {True, False}
 
 
 @pytest.mark.parametrize("count", [12, pytest.param(30, marks=pytest.mark.validate)])

@@ -119,9 +119,9 @@ def test_a_wall_behind_an_own_coupling():
     f, expected = 0.0, []
     for a, b in x[..., 0]:
         expected.append(f := max(0.0, 3000 * (a - b - 2 * 0.2 / 900 * f) / (1 + 3000 * 2 * 0.8 / 900)))
-    got = drive(walled(network, Weighted(), [0, 0], [0, 0]), x).f[:60, :, 0]
-    np.testing.assert_allclose(got, np.outer(expected, [1, -1]), rtol=0, atol=1e-12)
-    assert 0 < (got > 0).mean() < 0.5
+    forces = drive(walled(network, Weighted(), [0, 0], [0, 0]), x).f[:60, :, 0]
+    np.testing.assert_allclose(forces, np.outer(expected, [1, -1]), rtol=0, atol=1e-12)
+    assert 0 < (forces > 0).mean() < 0.5
     with pytest.raises(ValueError, match="the coupling is 2 x 2, the environment has 1 contacts"):
         load("one-wall").loop("I").law(Weighted())
 
@@ -205,20 +205,20 @@ def test_hands_on_walls_behind_certified_couplings_slow_down(name, humans, secon
     n = sets.scene.model.nv
     start = np.zeros((2 * n, humans))
     start[n:] = np.random.default_rng(1).uniform(-0.3, 0.3, (n, humans))
-    made, speed, strongest = np.zeros((2, humans)), np.zeros((4, humans)), 0.0
+    contacts, speed, strongest = np.zeros((2, humans)), np.zeros((4, humans)), 0.0
     ticks, outside = round(seconds / scenario.T), sets.scene.outside
 
     def look(buffer, first, count):
         nonlocal strongest
         touching = loop.process.law.depths(buffer.z) > 0
         i = min(4 * first // ticks, 3)
-        made[min(i, 1)] += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))
+        contacts[min(i, 1)] += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))
         speed[i] += (buffer.s[:count, n:] ** 2).sum(axis=(0, 1))
         strongest = max(strongest, np.abs(buffer.f[:count]).max())
 
     run_blocks(loop.process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, look)
-    assert made.sum() > 10 * humans
-    assert (made[0] > 0).mean() > 0.9
+    assert contacts.sum() > 10 * humans
+    assert (contacts[0] > 0).mean() > 0.9
     assert strongest < loop.process.force_limit.min()
     assert (speed[-1] < 0.25 * speed[0]).all()
 

@@ -363,7 +363,7 @@ def turned(loop: Loop, Q: np.ndarray) -> Loop:
 def test_turning_the_axes_keeps_each_requirement(turns: int) -> None:
     """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i per device keeps each requirement."""
     rng = np.random.default_rng(3)
-    asked = [
+    cases = [
         (LOOP, "this-environment", None),
         (LOOP, "any-environment", None),
         (LATE, "this-environment", None),
@@ -372,7 +372,7 @@ def test_turning_the_axes_keeps_each_requirement(turns: int) -> None:
         (SWITCHED, "any-environment", (5000.0, 4000.0)),
         (LOOP, LimitedForces(held=(7.0, 11.0)), (0.26, 0.742)),
     ]
-    before = [required_damping(loop, BUILT, condition, values).ratio for loop, condition, values in asked]
+    before = [required_damping(loop, BUILT, condition, values).ratio for loop, condition, values in cases]
     for number in range(turns):
         parts = [np.linalg.qr(rng.normal(size=(2, 2)))[0] for _ in range(2)]
         Q = np.zeros((4, 4))
@@ -380,8 +380,8 @@ def test_turning_the_axes_keeps_each_requirement(turns: int) -> None:
         whole = np.zeros((6, 6))
         whole[:4, :4], whole[4:, 4:] = Q, np.linalg.qr(rng.normal(size=(2, 2)))[0]  # the mass may turn, too
         coupling = _MatrixSpringDamper(symmetric(Q.T @ BUILT.K @ Q), BUILT.B)
-        i = number % len(asked)
-        loop, condition, values = asked[i]
+        i = number % len(cases)
+        loop, condition, values = cases[i]
         after = required_damping(turned(loop, whole), coupling, condition, values).ratio
         assert after == pytest.approx(before[i], abs=1e-10), (number, condition)
 

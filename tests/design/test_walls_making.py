@@ -337,17 +337,17 @@ def swinging(loop, coupling, damping, ticks, seed=11):
     step, tick = np.ascontiguousarray(np.moveaxis(expm(A * loop.T)[:, :2], 0, 2)), loop.law(coupling).transition()
     plant = rng.standard_normal((HANDS, 2)).T * [[1e-2], [0.1]]
     before, after = np.zeros((2, loop.walled(coupling).order + 2, HANDS))
-    made, touching, fastest = 0, np.zeros(HANDS, dtype=bool), 0.0
+    contacts, touching, fastest = 0, np.zeros(HANDS, dtype=bool), 0.0
     for k in range(ticks):
         before[-1] = plant[0]
         tick(before, after)
         before[:-1] = after[1:]
         plant = (step * [*plant, after[0]]).sum(axis=1)
         now = after[-1] > 0
-        made, touching = made + int((now & ~touching).sum()), now
+        contacts, touching = contacts + int((now & ~touching).sum()), now
         if k > 0.98 * ticks:
             fastest = max(fastest, float(np.abs(plant[1]).max()))
-    return fastest, made
+    return fastest, contacts
 
 
 @pytest.mark.slow
@@ -356,8 +356,8 @@ def test_hands_rest_at_the_requirement_not_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = required_damping(loop, coupling, "this-environment").required[0]
     ticks = 12_000 if damping else 20_000
-    fastest, made = swinging(loop, coupling, 1.02 * need, ticks)
-    assert made > (300 if damping else 500)
+    fastest, contacts = swinging(loop, coupling, 1.02 * need, ticks)
+    assert contacts > (300 if damping else 500)
     assert fastest < 0.05  # Heavy hands come to rest last.
     assert swinging(loop, coupling, short * need, ticks // 3)[0] > 0.5  # These hands never rest.
 

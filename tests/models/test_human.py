@@ -158,24 +158,24 @@ def hill(elastic=400.0, damping=9.0, tissue=0.004, parallel=150.0, mass=0.25):
 
 def test_the_plant_has_the_ports_matrices():
     port, d = hill(), DEVICE
-    got = plant(build([d], [Own(port)]).model)
+    linear = plant(build([d], [Own(port)]).model)
     K = np.array([[400 + 150, -400], [-400, 400.0]])
     D = np.array([[0.9 + 0.5, 0], [0, 9.0]])
     M = np.diag([0.2 + 0.25, 0.004])
-    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    np.testing.assert_allclose(linear.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
     # The voluntary force shortens the contractile part: it pulls the tissue towards the base.
     scene = build([d], [Own(port)])
-    np.testing.assert_allclose(M @ got.B[2:, scene.pushed[0]], [0, 1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(M @ linear.B[2:, scene.pushed[0]], [0, 1], rtol=0, atol=1e-12)
 
 
 def test_levers_enter_the_plants_matrices():
     """A spring on a lever lengthens by 2 x_2 - x_1 / 2; another one by 3 x_2 alone."""
     port = Port([0.1, 0.5], [[-0.5, 2, 0], [0, 3, 0]], [1.0, 2.0], [100.0, 50.0])
-    got, M = plant(build([DEVICE], [Own(port)]).model), np.diag([0.3, 0.5])
+    linear, M = plant(build([DEVICE], [Own(port)]).model), np.diag([0.3, 0.5])
     row, other = np.array([-0.5, 2.0]), np.array([0.0, 3.0])
     K = 100 * np.outer(row, row) + 50 * np.outer(other, other)
     D = 1 * np.outer(row, row) + 2 * np.outer(other, other) + np.diag([0.9, 0])
-    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    np.testing.assert_allclose(linear.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
 
 
 def test_bodies_and_state_space_agree():

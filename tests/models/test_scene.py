@@ -15,26 +15,26 @@ ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))
 
 def test_compliant_device_is_a_two_mass_oscillator():
     d, h = CompliantDevice(transmission_damping=0.2), HAND.links[0]
-    got = plant(build([d], [HAND]).model)
+    linear = plant(build([d], [HAND]).model)
     M = np.diag([d.motor_mass, d.handle_mass + h.mass])
     k, c = d.transmission_stiffness, d.transmission_damping
     K = np.array([[k, -k], [-k, k + h.stiffness]])
     D = np.array([[d.damping + c, -c], [-c, c + h.damping]])
-    np.testing.assert_allclose(got.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-12)
-    np.testing.assert_allclose(got.A[2:, 2:], -np.linalg.solve(M, D), rtol=1e-12)
+    np.testing.assert_allclose(linear.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-12)
+    np.testing.assert_allclose(linear.A[2:, 2:], -np.linalg.solve(M, D), rtol=1e-12)
     # The device feels -f; the external force acts on the handle.
-    np.testing.assert_allclose(got.B[2:], [[0, -1 / d.motor_mass], [1 / (d.handle_mass + h.mass), 0]], rtol=1e-12)
-    np.testing.assert_array_equal(got.C, [[1, 0, 0, 0]])
+    np.testing.assert_allclose(linear.B[2:], [[0, -1 / d.motor_mass], [1 / (d.handle_mass + h.mass), 0]], rtol=1e-12)
+    np.testing.assert_array_equal(linear.C, [[1, 0, 0, 0]])
 
 
 def test_a_rigid_device_and_arm_match_their_equations():
     d, (hand, arm) = RigidDevice(), ARM.links
-    got = plant(build([d], [ARM]).model)
+    linear = plant(build([d], [ARM]).model)
     M = np.diag([d.mass + hand.mass, arm.mass])
     K = np.array([[hand.stiffness, -hand.stiffness], [-hand.stiffness, hand.stiffness + arm.stiffness]])
     D = np.array([[d.damping + hand.damping, -hand.damping], [-hand.damping, hand.damping + arm.damping]])
-    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
-    np.testing.assert_allclose(got.B[2:], [[1 / M[0, 0], 0, -1 / M[0, 0]], [0, 1 / arm.mass, 0]], rtol=1e-12)
+    np.testing.assert_allclose(linear.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    np.testing.assert_allclose(linear.B[2:], [[1 / M[0, 0], 0, -1 / M[0, 0]], [0, 1 / arm.mass, 0]], rtol=1e-12)
 
 
 def test_several_channels_do_not_touch_each_other():
@@ -67,7 +67,7 @@ def test_a_person_is_two_arms_on_one_body():
     """The plant equals matrices written by hand, for rigid devices and arms of one and two links."""
     d, (one,), (near, far), p = RigidDevice(), HAND.links, ARM.links, TWO_HANDS
     scene = build([d, d], [HAND, ARM], [p])
-    got = plant(scene.model)
+    linear = plant(scene.model)
     assert [scene.model.joint(j).name for j in range(4)] == ["device_1/motor", "device_2/motor", "human_2_2", "body_1"]
     M = np.diag([d.mass + one.mass, d.mass + near.mass, far.mass, p.mass])
 
@@ -84,11 +84,11 @@ def test_a_person_is_two_arms_on_one_body():
 
     K = springs(one.stiffness, near.stiffness, far.stiffness, p.stiffness, p.cross.stiffness)
     D = springs(one.damping, near.damping, far.damping, p.damping, p.cross.damping) + np.diag([d.damping] * 2 + [0, 0])
-    np.testing.assert_allclose(got.A[4:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    np.testing.assert_allclose(linear.A[4:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
     # A muscle acts between an arm's last link and the body; taps act on the hands.
-    pushed = M @ got.B[4:][:, list(scene.pushed)]
+    pushed = M @ linear.B[4:][:, list(scene.pushed)]
     np.testing.assert_allclose(pushed, [[1, 0], [0, 0], [0, 1], [-1, -1]], rtol=0, atol=1e-12)
-    tapped = M @ got.B[4:][:, list(scene.tapped)]
+    tapped = M @ linear.B[4:][:, list(scene.tapped)]
     np.testing.assert_allclose(tapped, [[1, 0], [0, 1], [0, 0], [0, 0]], rtol=0, atol=1e-12)
 
 

@@ -499,8 +499,8 @@ def test_the_lemma_is_named_for_its_contacts_only(tmp_path, more):
     )
     pair = f'<contact><pair geom1="left" geom2="right" solimp="0.9 0.9" {more}/></contact>'
     scene = world(tmp_path, f"<mujoco><worldbody>{bodies}</worldbody>{pair}</mujoco>")
-    said = {part.what: part.at_the_port for part in scene.parts()}
-    assert any(at_the_port.startswith("lemma") for at_the_port in said.values()) == (not more)
+    bounds = {part.what: part.at_the_port for part in scene.parts()}
+    assert any(at_the_port.startswith("lemma") for at_the_port in bounds.values()) == (not more)
 
 
 def test_an_active_scene_is_listed(tmp_path):
