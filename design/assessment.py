@@ -700,9 +700,7 @@ def assess(
     own = None if is_ours(wanted_condition) else wanted_condition
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
-    requirements = requirements_of(here, coupling, known, own, progress)
-    if wanted_condition.name not in requirements:
-        requirements[wanted_condition.name] = judged(here, coupling, wanted_condition)
+    requirements = _requirements(loop, network, coupling, known, own, wanted_condition, progress)
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
     over = own if own and not own.beyond(loop) else over
     if known and known.condition != over.name:
@@ -710,11 +708,6 @@ def assess(
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
     if ranges and own and over is not own:
         ranges = replace(ranges, certificate=None, reason=own.beyond(loop))
-    if loop.varying_delay:
-        switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
-        switched += (KNOWN_DEVICE, KNOWN_DEVICE_ANY) if loop.known_devices else ()
-        switched += (own,) if own else ()
-        requirements |= {each.name: judged(loop.at(network), coupling, each) for each in switched}
     if limiter_proof is None and known and known.limiter:
         limiter_proof = known.limiter
     plugged = shelled(network if environment is None else environment)
@@ -742,11 +735,39 @@ def assess(
         wanted_condition.name,
         own,
     )
+    return _guaranteed(assessment)
+
+
+def _requirements(
+    loop: Loop,
+    network: Environment,
+    coupling: Coupling,
+    known: Certificate | None,
+    own: Condition | None,
+    wanted: Condition,
+    progress: Progress,
+) -> dict[str, Requirement]:
+    """Return the requirements for constant delays and, if delays switch, those of the conditions for switching."""
+    here = loop.at(network).switching(None)
+    requirements = requirements_of(here, coupling, known, own, progress)
+    if wanted.name not in requirements:
+        requirements[wanted.name] = judged(here, coupling, wanted)
+    if loop.varying_delay:
+        switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
+        switched += (KNOWN_DEVICE, KNOWN_DEVICE_ANY) if loop.known_devices else ()
+        switched += (own,) if own else ()
+        requirements |= {each.name: judged(loop.at(network), coupling, each) for each in switched}
+    return requirements
+
+
+def _guaranteed(assessment: Assessment) -> Assessment:
+    """Return the assessment with its guarantee, or with the reason why it has none."""
     guarantee, reason = _guarantee(assessment)
+    limits = assessment.force_limits
     # The search between the vertices does not evaluate the limiter's block, so the limiter is not proved for ranges.
     by_itself = limits.requirement is not None and limits.rho is not None
     if guarantee and guarantee.environments == RANGES and by_itself:
-        assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
+        assessment = replace(assessment, force_limits=replace(limits, less=True))
         guarantee, reason = _guarantee(assessment)
     if guarantee is None:
         return assessment.without_guarantee(str(reason))
