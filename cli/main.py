@@ -50,6 +50,11 @@ def main() -> NoReturn:
         print("usage: haptic-loop COMMAND [options], or python -m MODULE [options]; --help after either\n")
         print("\n".join([*lines[:_LEADING], "\nfurther commands:", *lines[_LEADING:]]))
         sys.exit(0)
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"haptic-loop {version('haptic-loop')}")
+        sys.exit(0)
     _run(words[0], words[1:])
 
 

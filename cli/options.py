@@ -99,11 +99,11 @@ class Parser(argparse.ArgumentParser):
         self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
-            what = "option" if rest[0].startswith("-") else "word"
-            help_ = "--help lists the options"
+            is_option, help_ = rest[0].startswith("-"), "--help lists the options"
+            near = self._near(rest[0]) if is_option or f"--{rest[0]}" in self._option_string_actions else ""
             if re.fullmatch(r"[\d.][\d.,e+-]*", rest[0]):
                 help_ = "several numbers are written with commas, as 1,2,3"
-            raise InputError(f"unknown {what} {rest[0]}{self._near(rest[0])} ({help_})")
+            raise InputError(f"{'unknown option' if is_option else 'unexpected word'} {rest[0]}{near} ({help_})")
         if "reference" in parsed:
             _translate(parsed)
         if ":" in (getattr(parsed, "condition", None) or ""):
@@ -262,7 +262,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def _translate(args: argparse.Namespace) -> None:
     """Set `case` from --reference or --case. Raises InputError for a contradiction."""
     if args.reference and args.case and args.reference != args.case:
-        raise InputError(f"--reference {args.reference} with --case {args.case}: give one of them")
+        remedy = "replace --case none by --coupling none" if args.case == "none" else "give one of them"
+        raise InputError(f"--reference {args.reference} with --case {args.case}: {remedy}")
     args.case = args.case or args.reference or "I"
 
 

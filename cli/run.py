@@ -266,12 +266,8 @@ def _rows(report: RunReport) -> render.Rows:
     yield "transparency error", felt and render.transparency_error(felt)
     yield from render.robustness_rows(report.robustness)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
-    yield (
-        "force error",
-        f"{apart} (forces before clipping; with a limiter, a budget or switching delays: sent forces)"
-        if apart
-        else f"- ({report.ideal_force.reason})",
-    )
+    before = ", before clipping" if stability.clipped_ticks and not report.compares_sent_forces else ""
+    yield "force error", f"{apart}{before}" if apart else f"- ({report.ideal_force.reason})"
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
     yield from _net_rows(report.energy_budget)
     yield "growth, eigenvalues", _growth(stability)

@@ -19,10 +19,9 @@ from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.result import MAKING, Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
-from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, HeldDevices, Plan
+from haptic_loop.sim.limit_cycles import UNDECIDED, HeldDevices, Plan
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_no_world
-from haptic_loop.sim.trace import SUSTAINED
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLES = (
@@ -253,12 +252,6 @@ def _remarks(report: MapReport) -> Iterator[str]:
         yield (
             f"Walls: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
             "humans meet each fixed set of touching walls; at the simulated points contact makes and breaks."
-        )
-    if simulation.points:
-        yield (
-            f"A simulated point oscillates if, at the end of {simulation.duration_s:g} s, some octave above "
-            f"{simulation.from_hz:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude and exceeds "
-            f"{simulation.threshold_m:g} m; {UNDECIDED}: the linear growth rate is within {DECIDED:g} 1/s of zero."
         )
     if report.interrupted:
         yield "Interrupted: the map shows the finished parts."

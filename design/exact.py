@@ -581,8 +581,7 @@ def rows_of(M: Matrix) -> _Rows:
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Return the reason why the named matrix does not prove that the block is strictly positive real, or None."""
-    if len(rows) != block.order:  # Only matrices in older files cover the states that no input reaches.
-        block = reached(block)
+    block = reached(block)
     n = block.order
     if len(rows) != n:
         return f"{name} has {len(rows)} rows, the block has {n} states"

@@ -15,11 +15,11 @@ from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 
-ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
+#: The one list of the package's conditions, in the order of tables and messages; design.certificate has the conditions.
+ConditionName = Literal["any-environment", "this-environment", "known-device", "known-device-any"]
 #: the environments that a certificate covers
 Environments = Literal["any passive environment", "these ranges", "this environment"]
 
-#: the names of all conditions, in the order of tables
 CONDITIONS: tuple[ConditionName, ...] = get_args(ConditionName)
 #: the conditions that need guaranteed bounds of the devices' motors and transmissions
 KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-device"))

@@ -79,6 +79,11 @@ class RunReport:
         """Whether the delays switch, so that no eigenvalue decides stability."""
         return bool(self.varying_delay and self.varying_delay.met)
 
+    @property
+    def compares_sent_forces(self) -> bool:
+        """Whether `ideal_force` compares forces as the devices received them, not forces before clipping."""
+        return self.switched or self.energy_budget is not None or self.assessment.force_limits.rho is not None
+
     def notes(self) -> list[str]:
         """Return remarks that explain the figures."""
         lines, guarantee = [], self.assessment.guarantee

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -120,3 +121,4 @@ def test_the_console_script_lists_and_runs_commands():
     unknown = run("python -m cli chekc", ROOT)
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert unknown.stderr == "error: unknown command 'chekc', did you mean check?\n"
+    assert run("python -m cli --version", ROOT).stdout == f"haptic-loop {version('haptic-loop')}\n"

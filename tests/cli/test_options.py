@@ -11,7 +11,9 @@ from messages import says
 from haptic_loop.cli import options, render
 from haptic_loop.cli.run import _parser as run_parser
 from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design.certificate import named
 from haptic_loop.design.files import one_line
+from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 
 
@@ -102,12 +104,23 @@ def test_reference_or_case_sets_the_case(words, case):
 def test_reference_and_case_must_agree():
     with pytest.raises(InputError, match="--reference I with --case II: give one of them"):
         run_parser().parse_args(["--reference", "I", "--case", "II"])
+    with pytest.raises(InputError, match="replace --case none by --coupling none"):
+        run_parser().parse_args(["--reference", "II", "--case", "none"])
+
+
+def test_every_message_lists_the_conditions_alike():
+    expected = f"is 'foo', allowed are {', '.join(CONDITIONS)}"
+    for refused in (options.condition, named):
+        with pytest.raises((argparse.ArgumentTypeError, ValueError), match=expected):
+            refused("foo")
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--delta 1.37 1.37", r"unknown word 1.37 \(several numbers are written with commas, as 1,2,3\)"),
+        ("--delta 1.37 1.37", r"unexpected word 1.37 \(several numbers are written with commas, as 1,2,3\)"),
+        ("extra", r"^unexpected word extra \(--help lists the options\)"),
+        ("scenario", "^unexpected word scenario, did you mean --scenario"),
         ("--delta 1.3,1.3,1.3", r"--delta has 3 entries, expected 2 \(one per device\) or 1"),
     ],
 )

@@ -57,6 +57,12 @@ def test_case_none_is_figure_5(tmp_path):
     assert np.abs(trace.f).max() == 12.0
 
 
+def test_rows_name_clipping_only_where_forces_clip(tmp_path, capsys):
+    for options, clips in ((("--case", "none"), True), (("--duration", "1"), False)):
+        run(tmp_path, *options, "--no-plot")
+        assert ("ideal force, before" in capsys.readouterr().out) is clips
+
+
 def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
     def interrupted(*picture):
         raise KeyboardInterrupt

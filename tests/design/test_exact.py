@@ -20,6 +20,8 @@ from haptic_loop.design.exact import (
     definiteness,
     find_storage,
     reached,
+    refuted_rows,
+    rows_of,
 )
 
 T = 1.2e-3
@@ -330,6 +332,11 @@ def test_unreachable_states_are_left_out():
     late = Lti(G.A.T, numbers([[0], [0], [1], [0]], Fraction(1)), G.C, G.D, Fraction(1))
     assert reached(late).order == 3
     np.testing.assert_allclose(at(reached(late), 1.3j), at(late, 1.3j), rtol=1e-12)
+    P, reason = find_storage(late)
+    assert reason is None
+    assert refuted_rows("P", late, rows_of(P)) is None
+    unreached = [*([*row, "0"] for row in rows_of(P)), ["0", "0", "0", "1"]]
+    assert refuted_rows("P", late, unreached) == "P has 4 rows, the block has 3 states"
 
 
 def test_a_wrong_riccati_solution_proves_nothing(monkeypatch):

@@ -98,7 +98,7 @@ def test_a_kept_model_is_the_scenarios_environment():
         V = Q @ np.linalg.inv(np.eye(2) - E0 @ Q)
         return np.linalg.solve(np.eye(2) + E @ V, E)
 
-    this, any_, behind = (sweep.ratios(name, np.array([300.0]), np.array([0.5]))[0] for name in sweep.conditions)
+    any_, this, behind = (sweep.ratios(name, np.array([300.0]), np.array([0.5]))[0] for name in sweep.conditions)
     assert behind == pytest.approx(densely(sweep, kept, 300.0, 0.5), rel=1e-5)
     assert behind != pytest.approx(this, rel=1e-4)
     assert np.isinf(any_)
@@ -117,7 +117,7 @@ def test_bare_walls_match_colgates_condition():
 
 def test_any_environment_requires_the_same_in_all_cells():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
-    assert sweep.conditions == ("this-environment", "any-environment")
+    assert sweep.conditions == ("any-environment", "this-environment")
     ratios = sweep.ratios("any-environment", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
     assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 
@@ -147,7 +147,7 @@ def test_maps_of_optimal_couplings_report_their_guarantee(tmp_path, capsys):
     assert report["kind"] == "optimal"
     assert report["assessment"]["guarantee"]["environments"] == HERE
     assert report["assessment"]["requirements"]["this-environment"]["proof"] == "rational"
-    assert report["conditions"] == ["this-environment", "any-environment"]
+    assert report["conditions"] == ["any-environment", "this-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0
     assert 0 < report["this-environment"]["certified_cells"] < 16
     assert report["simulation"]["differ_from_linear"] == 0
