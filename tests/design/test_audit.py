@@ -407,7 +407,7 @@ BAD = [
     ("--K 1 --B 1 --theta 0.5", "--theta is '0.5', expected whole numbers"),
     ("--K 1 --B 1 --seed x", "--seed is 'x'"),
     ("--K 1 --B 1 --json nowhere/x.json", "folder nowhere"),
-    ("--K 1 --B 1 --sceanrio x", "unknown option --sceanrio, did you mean --scenario"),
+    ("--K 1 --B 1 --sceanrio x", "unknown option --sceanrio .. --scenario"),
 ]
 
 

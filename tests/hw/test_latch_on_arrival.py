@@ -164,7 +164,7 @@ def test_sessions_with_arrival_latching_replay_bit_for_bit(tmp_path, capsys):
     [
         (
             ["--condition", "any-environment", "--psi", "1"],
-            "--condition any-environment with --latch arrival: with delay in the environment",
+            "--condition any-environment with --latch arrival",
         ),
         (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
         (["--latency", "1e-4"], "latency: hw.bridge does not simulate this key"),

@@ -22,7 +22,7 @@ TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 
 BAD = [
     ("theta = [1, 2]", "theta = [1, 1.5]", "theta #2 = 1.5: expected `int`, got `float`"),
-    ("theta = [1, 2]", "theta = [1]", "theta has 1 entries, but the environment has 2 contacts"),
+    ("theta = [1, 2]", "theta = [1]", "theta has 1 entries .. 2 contacts"),
     ("theta = [1, 2]", "theta = [1, -1]", "theta #2 is -1 .. 0 to 1000 samples"),
     ("theta = [1, 2]", "theta = [1, true]", "theta #2 = True: expected `int`"),
     ("psi = [0, 0]", "psi = [0, 0, 0]", "psi has 3 entries"),
@@ -31,9 +31,9 @@ BAD = [
     ("T = 1.2e-3", "T = nan", "T is nan"),
     ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
     ("T = 1.2e-3", "T == 1", "not valid TOML"),
-    ("name = ", "nam = ", "unknown field `nam` (did you mean `name`?)"),
+    ("name = ", "nam = ", "`nam` .. `name`"),
     ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06 .. 1e-06 to 1000 kg"),
-    ("motor_mass = 0.06 ", "motor_mas = 0.06", "unknown field `motor_mas` (did you mean `motor_mass`?)"),
+    ("motor_mass = 0.06 ", "motor_mas = 0.06", "`motor_mas` .. `motor_mass`"),
     ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m .. values in (0, damping = 1.37]"),
     ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft' .. 'compliant'"),
     (
@@ -47,7 +47,7 @@ BAD = [
     ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed in"),
     ("mass = 1.0 }", "mas = 1.0 }", "masses lists 'mas', which no spring or wall reaches"),
     ("channel = 1", "channel = 3", "tap.channel is 3 .. 1 to 2"),
-    ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
+    ("[tap]", "[tapp]", "`tapp` .. `tap`"),
     ("duration = 15.0", "duration = 0.0", "duration is 0"),
 ]
 
@@ -84,10 +84,10 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
     assert scenario.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
     assert scenario.replace(theta=(1, 1)).human == scenario.human
     for empty, expected in (
-        ("psi", "but the environment has 2 contacts"),
+        ("psi", "2 contacts"),
         ("human", "expected 2, one for each device"),
     ):
-        with pytest.raises(InputError, match=rf"{empty} has 0 entries, {expected}"):
+        with pytest.raises(InputError, match=rf"{empty} has 0 entries.* {expected}"):
             parse(bare.replace("theta", f"{empty} = []\ntheta"))
     with pytest.raises(InputError, match=r"^x: missing T, theta; every scenario has name, T, theta, device, environ"):
         parse(bare.replace("T = 1e-3\ntheta = [3, 1]\n", ""), "x")
@@ -185,7 +185,7 @@ def test_scripts_may_use_lists_arrays_and_integers():
         ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
         ({"delta": (1.0, "x")}, "delta #2 = 'x': expected `float`, got `str`"),
         ({"delta": (float("nan"), 1.0)}, "delta #1 is nan .. 0 to 10000 N s/m"),
-        ({"thta": (1, 1)}, "unknown field `thta` (did you mean `theta`?)"),
+        ({"thta": (1, 1)}, "`thta` .. `theta`"),
     ],
 )
 def test_replacing_is_as_strict_as_a_file(change, message):
@@ -267,9 +267,7 @@ def test_device_axes_must_be_as_many_as_contacts():
     network = load("omega-space").environment
     with pytest.raises(InputError) as caught:
         load().replace(device=[plane, plane], environment=network, theta=(1, 1), psi=(0, 0))
-    assert str(caught.value).startswith(
-        "device has 2 entries with 4 free axes in all, but the environment has 6 contacts (left.x, left.y"
-    )
+    assert says(caught.value, "device has 2 entries with 4 free axes .. 6 contacts (left.x, left.y")
 
 
 @pytest.mark.parametrize("case", ["III", "i", "", None, 1])
@@ -396,7 +394,7 @@ def test_measured_friction_replaces_the_published_bound():
         ('["omega.3", "inverse3"]', "device #2: nobody publishes damping [N s/m] and force_limit [N] of inverse3"),
         ('["omega.3", "falkon"]', "device #2: device is 'falkon' (did you mean falcon?), the catalogue has omega.3"),
         ('[{ device = "falcon", damping = -1.0 }, "omega"]', "device #1: damping is -1"),
-        ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "unknown field `mas` (did you mean `mass`?)"),
+        ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "`mas` .. `mass`"),
     ],
 )
 def test_incomplete_or_unknown_devices_are_refused(device, message):
