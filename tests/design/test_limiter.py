@@ -223,7 +223,7 @@ def test_linear_proofs_survive_a_refused_limiter(tmp_path):
     plain = prove(PAIR, stiff, "this-environment")
     assert plain.facts == ()
     assert limiter_rho(PAIR, plain) is None
-    with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
+    with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m.* 1.37, 1.37"):
         prove_limiter(PAIR, stiff)
 
 

@@ -279,7 +279,7 @@ def test_scenarios_keep_own_hands():
     scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),)))
     assert scenario.replace(theta=(2, 2)).human == scenario.human
     assert len({held_by(Muscle(mass=m), Muscle()).digest for m in (0.2, 0.3, 0.3)}) == 2
-    with pytest.raises(InputError, match="human has 1 entries"):
+    with pytest.raises(InputError, match="human has 1 "):
         held_by(Muscle())
     with pytest.raises(InputError, match="human #2 is None, expected a Human"):
         held_by(Muscle(), None)

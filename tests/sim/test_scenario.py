@@ -85,9 +85,9 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
     assert scenario.replace(theta=(1, 1)).human == scenario.human
     for empty, expected in (
         ("psi", "2 contacts"),
-        ("human", "expected 2, one for each device"),
+        ("human", "2, one for each device"),
     ):
-        with pytest.raises(InputError, match=rf"{empty} has 0 entries.* {expected}"):
+        with pytest.raises(InputError, match=rf"{empty} has 0 .* {expected}"):
             parse(bare.replace("theta", f"{empty} = []\ntheta"))
     with pytest.raises(InputError, match=r"^x: missing T, theta; every scenario has name, T, theta, device, environ"):
         parse(bare.replace("T = 1e-3\ntheta = [3, 1]\n", ""), "x")
@@ -144,7 +144,7 @@ def test_replaced_fields_are_checked():
     for change, message in [
         ({"theta": (1, 2, 3)}, "theta has 3 entries"),
         ({"delta": (1.0, -1.0)}, r"delta #2 is -1.*0 to 10000 N s/m"),
-        ({"delta": (1.0,)}, "delta has 1 entries for 2 devices"),
+        ({"delta": (1.0,)}, "delta.* 1 .* 2 devices"),
     ]:
         with pytest.raises(InputError, match=message):
             scenario.replace(**change)
@@ -180,7 +180,7 @@ def test_scripts_may_use_lists_arrays_and_integers():
         ({"T": 1j}, "T holds 1j (complex), which no scenario can have"),
         ({"name": b"x"}, "name holds b'x' (bytes), which no scenario can have"),
         ({"human": None}, "human: expected `array`, got `null`"),
-        ({"device": ("a", "b")}, "device #1: device is 'a', the catalogue has omega.3"),
+        ({"device": ("a", "b")}, "device #1: device is 'a' .. omega.3"),
         ({"device": (1, 2)}, "device #1 = 1: expected `object`, got `int`"),
         ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
         ({"delta": (1.0, "x")}, "delta #2 = 'x': expected `float`, got `str`"),
@@ -222,7 +222,7 @@ def test_delta_applies_to_the_new_devices():
         RigidDevice(damping=1.0),
         RigidDevice(damping=0.5),
     )
-    with pytest.raises(InputError, match="delta has 2 entries for 1 devices"):
+    with pytest.raises(InputError, match=r"delta.* 2 .* 1 devices"):
         load().replace(delta=(1.0, 0.5), device=[rigid])
 
 
@@ -392,7 +392,7 @@ def test_measured_friction_replaces_the_published_bound():
     [
         ('"falcon"', "device #1: nobody publishes damping [N s/m] of falcon: give it beside `device`"),
         ('["omega.3", "inverse3"]', "device #2: nobody publishes damping [N s/m] and force_limit [N] of inverse3"),
-        ('["omega.3", "falkon"]', "device #2: device is 'falkon' (did you mean falcon?), the catalogue has omega.3"),
+        ('["omega.3", "falkon"]', "device #2: device is 'falkon' .. falcon .. omega.3"),
         ('[{ device = "falcon", damping = -1.0 }, "omega"]', "device #1: damping is -1"),
         ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "`mas` .. `mass`"),
     ],

@@ -455,7 +455,7 @@ def test_adversaries_contradict_certificates_only():
     ("options", "message"),
     [
         (["--humans", "0"], "--humans is 0.*1 to 1000000"),
-        (["--humans", "many"], "--humans is 'many', expected a whole number"),
+        (["--humans", "many"], "--humans is 'many'"),
         (["--engine", "drake"], "--engine is 'drake'.*exact, mujoco, both"),
         (["--links", "9"], "--links is '9'"),
         (["--shards", "0"], "--shards is 0.*1 to 256"),
