@@ -19,6 +19,7 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
+from PIL import Image
 
 from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
@@ -142,9 +143,11 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     _literal(figure)
     relabel(figure)
     figure.set_dpi(dpi)
-    content = BytesIO()
-    # savefig would draw a figure with a layout twice. Compression 3 is faster than the default; files are 6 % larger.
-    FigureCanvasAgg(figure).print_png(content, pil_kwargs={"compress_level": 3})
+    content, canvas = BytesIO(), FigureCanvasAgg(figure)
+    canvas.draw()  # savefig would draw a figure with a layout twice.
+    # Every pixel is opaque. Without opacity and with compression 1, a file takes half the time and is 6 % smaller.
+    opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    opaque.save(content, "png", compress_level=1, dpi=(dpi, dpi))
     return content.getvalue()
 
 
