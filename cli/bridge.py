@@ -6,6 +6,7 @@ Steps of a session: port -> handshake -> delay -> coupling and certificate -> ar
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -31,6 +32,7 @@ from haptic_loop.sim.couplings import NAMES, encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
+_FAST = 1.0  # [m/s] speed of a free handle above which the bridge advises a smaller force cap
 _LONGEST = 3600.0  # [s] largest --duration (time at full gain after arming), because the trace is kept in memory
 
 
@@ -166,6 +168,8 @@ def _print_certificate(
         f"the certificate is for {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
+    if fast := _fast_handle(programs[0].scenario, caps):
+        console.print(fast, highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the measured delay, and reserves for longer delays"
     console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
@@ -216,6 +220,17 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
         f"ticks of the device last {span} ms, certified up to {longest:.4g} ms{known}; one longer tick "
         f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
     )
+
+
+def _fast_handle(scenario: Scenario, caps: Sequence[float]) -> str | None:
+    """Name the axis whose free handle may get faster than _FAST under a constant force at its cap, or return None."""
+    speeds = [scenario.lever * cap / delta for cap, delta in zip(caps, scenario.delta, strict=True)]
+    fastest = max(speeds)
+    if fastest <= _FAST:
+        return None
+    axis, enough = speeds.index(fastest), scenario.delta[speeds.index(fastest)] * _FAST / scenario.lever**2
+    if_wrong = f"if its force is wrong, a free handle of axis {axis + 1} moves at up to {fastest:.3g} m/s"
+    return f"{if_wrong}: --force-cap {math.floor(100 * enough) / 100:g} keeps it below {_FAST:g} m/s"
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:

@@ -46,7 +46,7 @@ class Operator:
         if self.deadman:
             if self.deadman() or session.stage not in DRIVING or self._seen_at is None:
                 self._seen_at = now
-            if now - self._seen_at > _DEADMAN_US and session.stage != Stage.DISARMING:
+            if now - self._seen_at > _DEADMAN_US:
                 return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now, let_go=True)
         if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
             return session.stop("the time is over", now)

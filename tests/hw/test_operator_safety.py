@@ -33,7 +33,7 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import IncidentLog, outcome
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, load
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -71,6 +71,27 @@ def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
 def test_holding_the_deadman_continues_the_session(scenario, rungs):
     session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
+
+
+def test_the_last_test_needs_the_deadman(scenario, rungs):
+    """The last sign of a person comes at full gain, and 1 s later the motors are being tested for the last time."""
+    rehearsal = rehearsal_of(
+        scenario, rungs, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
+    )
+    session = rehearsal.session
+    rehearsal.run_until_armed(4.0)
+    assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "deadman: 1")
+    at = {event.stage: event.t_us for event in session.log}
+    assert 1e-6 * (at[Stage.STOPPED] - at[Stage.ARMED]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_fast_free_handles_are_announced():
+    """A force F moves a handle with damping b at F/b; at the radius r of a wheel a torque r F moves it at r^2 F/b."""
+    three, wheel = load("three-rigid"), load("omega-pair").replace(unit="rad", radius=0.2)
+    assert "axis 2 moves at up to 1.62 m/s: --force-cap 0.8 " in bridge._fast_handle(three, [1.3] * 3)
+    assert bridge._fast_handle(three, [0.8] * 3) is None
+    assert bridge._fast_handle(wheel, [0.2 * 1.3] * 2) is None
+    assert "--force-cap 34.2" in bridge._fast_handle(wheel, [0.2 * 35, 0.2 * 30])
 
 
 def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
