@@ -207,7 +207,7 @@ def test_binding_frequencies_are_marked(undrawn):
     assert "soft (no curve: see the printed remarks)" in lines(anywhere)
     here, anywhere = undrawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
     assert here.get_ylabel() == "required damping over available damping"
-    assert anywhere.get_title() == "any passive environment (with a multiplier for this environment)"
+    assert anywhere.get_title() == f"{ANY} (with a multiplier for {HERE})"
 
 
 def test_drawn_curves_are_the_reported_ones(undrawn):
@@ -263,7 +263,7 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
     assert legend(figure) == [
         "exact: stable with all of 7 humans",
         "exact: unstable with some",
-        "this environment: certified below this edge",
+        f"{HERE}: certified below this edge",
         "any-environment: certified below this edge",
         "MuJoCo: rests (1)",
         "MuJoCo: oscillates (1)",
@@ -304,14 +304,14 @@ def test_environment_maps_mark_their_design_point(drawn):
     figure = drawn(map_plot.plot_zwidth, k_b_map(), map_report(fixed=fixed, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other spring is not on the map
-    assert "this environment: certified inside this edge" in legend(figure)
+    assert f"{HERE}: certified inside this edge" in legend(figure)
 
 
 def test_legends_say_where_maps_are_certified(drawn):
     stiffer = k_b_map()
     stiffer.ratio = {"any-environment": np.array([2, 2, 2, 0.5, 2, 2.0])}
     figure = drawn(map_plot.plot_zwidth, stiffer, map_report(psi=[0, 0]))
-    assert "any passive environment: certified above this edge" in legend(figure)
+    assert f"{ANY}: certified above this edge" in legend(figure)
 
 
 def test_every_unit_in_a_picture_becomes_rotary():

@@ -25,7 +25,7 @@ from PIL import Image
 from haptic_loop import simulate
 from haptic_loop.cli import view as command
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.design.result import Chosen
+from haptic_loop.design.result import HERE, Chosen
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Human, Link, Person, Voluntary
 from haptic_loop.models.scene import APART, build, plant
@@ -392,11 +392,11 @@ def test_a_person_s_body_stands_behind_both_arms():
 def test_the_overlay_says_growth_and_certificates(none, published):
     overlay = dict(_overlay(session(none).frame(0.1), live=True))
     assert overlay["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
-    assert overlay["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
+    assert overlay[HERE] == "needs 1.723 of 1.37 N s/m: NOT certified"
     assert overlay["any environment"] == "no certificate"
     assert "0 overruns" in overlay["clock"]
     overlay = dict(_overlay(session(published).frame(0.1), live=False))
-    assert overlay["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
+    assert overlay[HERE] == "needs 1.399 of 1.37 N s/m: NOT certified"
     assert overlay["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
     assert overlay["time"] == "0.1 s"
     assert (GIVEN in dict(keys_help(True)).values(), GIVEN in dict(keys_help(False)).values()) == (True, False)
