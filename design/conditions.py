@@ -47,7 +47,7 @@ from haptic_loop.design.frequency import (
     supremum,
     too_long,
 )
-from haptic_loop.design.result import Environments, Requirement, from_ratio, refusal
+from haptic_loop.design.result import ANY, HERE, RANGES, Environments, Requirement, from_ratio, refusal
 
 
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
@@ -306,7 +306,7 @@ class Condition(ABC):
         missing = [name for name, is_there in zip(BEYOND, present, strict=True) if is_there and name not in covered]
         if missing:
             return f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
-        return loop.environment.active(loop.T) if self.guarantee(loop) == "any passive environment" else None
+        return loop.environment.active(loop.T) if self.guarantee(loop) == ANY else None
 
     @property
     def base(self) -> str:
@@ -316,7 +316,7 @@ class Condition(ABC):
     def fact_names(self, loop: Loop) -> tuple[str, ...]:
         """Return the names of `FACTS` that a certificate of this loop lists."""
         walls, limited = loop.environment.walls, self.parameters(loop)
-        ranges = loop.ranges and self.guarantee(loop) != "this environment"
+        ranges = loop.ranges and self.guarantee(loop) != HERE
         present = loop.latency, walls, limited, loop.varying_delay, ranges
         return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
 
@@ -355,7 +355,7 @@ class Condition(ABC):
     def guarantee(self, loop: Loop) -> Environments:
         """Return the environments for which the condition holds."""
         # Ranges are proved at every vertex; check_ranges and design.check search between the vertices.
-        return "these ranges" if loop.ranges else "this environment"
+        return RANGES if loop.ranges else HERE
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
         """Return the beginning of a message on a matrix: the member of the ranges that it belongs to, or ""."""
@@ -379,7 +379,7 @@ class Condition(ABC):
     def words(self, loop: Loop) -> str:
         """Return the environments for which the condition holds, in the words of a report."""
         held = self.guarantee(loop)
-        return loop.environment.here if held == "this environment" else held
+        return loop.environment.here if held == HERE else held
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:

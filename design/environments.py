@@ -66,6 +66,8 @@ from haptic_loop.design.frequency import (
 )
 from haptic_loop.design.lmi import RESERVE, Ports, balanced, lemma1, packed, symmetric_from, unit_environment
 from haptic_loop.design.result import (
+    ANY,
+    HERE,
     MAKING,
     DesignFailed,
     Environments,
@@ -816,7 +818,7 @@ class _AnyEnvironment(Multiplied):
         return None if any(loop.psi) or self._extended else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Environments:
-        return "this environment" if any(loop.psi) else "any passive environment"
+        return HERE if any(loop.psi) else ANY
 
 
 ANY_ENVIRONMENT = _AnyEnvironment()

@@ -46,6 +46,8 @@ from haptic_loop.design.environments import (
 from haptic_loop.design.facts import Fact, KnownMotor, Limited, PeriodCost, Unknowns, Values, compose, compose_any
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.result import (
+    ANY,
+    HERE,
     MAKING,
     DesignFailed,
     Environments,
@@ -775,7 +777,7 @@ class KnownDevice(Condition):
         return super().least_multiplier(loop)
 
     def words(self, loop: Loop) -> str:
-        return MAKING if loop.environment.walls and self.guarantee(loop) == "this environment" else super().words(loop)
+        return MAKING if loop.environment.walls and self.guarantee(loop) == HERE else super().words(loop)
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         if multiplier is None:
@@ -900,7 +902,7 @@ class _KnownDeviceAny(KnownDevice):
         return (0.0,) * loop.channels if type(self) is _KnownDeviceAny else None
 
     def guarantee(self, loop: Loop) -> Environments:
-        return "any passive environment"
+        return ANY
 
 
 _LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of the shares of the damping that `ratios` tries

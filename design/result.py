@@ -32,7 +32,9 @@ MAKING = (
     "this environment; its walls may have any gap, make and break contact, and be softer in stiffness and damping alike"
 )
 
-ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
+ANY: Environments = "any passive environment"
+RANGES: Environments = "these ranges"
+HERE: Environments = "this environment"
 #: titles of two conditions in pictures; every other condition has its name as its title
 TITLES = {"this-environment": HERE, "any-environment": ANY}
 #: what every certificate assumes and does not cover, in words
