@@ -16,7 +16,7 @@ from haptic_loop.sim.scenario import InputError, require_even_ticks, require_lin
 
 _MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; 3 million take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: error of the growth rate [1/s], the larger with and without coupling",
+    "position: relative rms error; growth: error of the growth rate [1/s], with or without coupling (the larger one)",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
     "real: simulated seconds per second; *: right, and on its engine's Pareto front of speed and both errors",
 )
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
     if scenario.samples * default > _MOST_STEPS:
         longest = _MOST_STEPS // default * scenario.T
-        raise InputError(f"--duration: RK4 needs {default} steps a tick here; allowed are up to {longest:.3g} s")
+        raise InputError(f"--duration is too long for RK4 with {default} substeps a tick: give at most {longest:.3g} s")
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
     report = _Report(args.case, scenario.name, chosen.kind, default, *measured)

@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
     test = trial(block)
     write(path, comments_in_unit(c_source(block, test, path.name)))
 
-    forces = "not limited in this file: a proof covers forces below the motors' limits"
+    forces = "not limited by the C code: a proof covers only forces below the motors' limits"
     forces += " (--force-limit adds the limiter)" if limiter_rho(stored.loop, stored.certificate) is not None else ""
     if block.limiter:
         limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
@@ -134,7 +134,7 @@ def _parser() -> options.Parser:
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
-    """Return the block to export, with comment lines on its source. Raises InputError if the coupling has none."""
+    """Return the block to export, with comment lines on its source. Raises InputError if file or options allow none."""
     limit, balls = _force_limits(args.force_limit, stored.loop) if args.force_limit else (None, ())
     try:
         block = process_block(stored, not args.without_theta, limit, balls) if args.process else coupling_block(stored)

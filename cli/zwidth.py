@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
     if args.case == "II" and of_coupling:
-        raise InputError("--case II is only with --coupling: certificates of a map's spring-dampers need no reference")
+        raise InputError("--case II is only with --coupling: a map of spring-dampers is compared with no reference")
     chosen = chosen_by(args, scenario) if args.coupling else None
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
+    what = "Draw the Z-width map: which K and B are certified, and which are stable with random humans and in MuJoCo."
     parser = options.Parser("sim.zwidth", what, *_EXAMPLES, first="scenario rigid coupling mark grid out")
     parser.add_loop()
     parser.add_rigid()
@@ -90,7 +90,7 @@ def _parser() -> options.Parser:
     names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
     parser.add_condition(
-        "with --coupling: condition of its design (default: that of the coupling); your own is always drawn", to=of_map
+        "with --coupling: condition to design for (default: the coupling's); your own is drawn in every map", to=of_map
     )
     rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
@@ -114,7 +114,7 @@ def _parser() -> options.Parser:
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the map varies the environment"
     parser.only(gains, lambda args: args.coupling is None, "rigid")
-    compared = "with --coupling: certificates of a map's spring-dampers need no reference"
+    compared = "with --coupling: a map of spring-dampers is compared with no reference"
     parser.only(compared, lambda args: args.coupling, "lam", "reference")
     return parser
 
@@ -250,8 +250,8 @@ def _remarks(report: MapReport) -> Iterator[str]:
         yield f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation.differ_from_linear} points."
     if report.walls:
         yield (
-            f"Walls: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
-            "humans meet each fixed set of touching walls; at the simulated points contact makes and breaks."
+            f"Walls: this-environment covers {MAKING}. The growth with random humans is computed for each "
+            "fixed set of touching walls; in the simulations contact makes and breaks."
         )
     if report.interrupted:
         yield "Interrupted: the map shows the finished parts."
@@ -263,8 +263,8 @@ def _about(conditions: Sequence[str]) -> str:
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
-        f"{line}. The coupling's model is the cell's environment for this-environment, the population and MuJoCo; "
-        f"for {zwidth.MODEL_KEPT} it is the environment of the coupling's design."
+        f"{line}. In this-environment, the population and MuJoCo the coupling has a model of the cell's environment; "
+        f"for {zwidth.MODEL_KEPT} it has a model of the scenario's environment."
     )
 
 

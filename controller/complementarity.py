@@ -75,9 +75,9 @@ class Complementarity(_Problem):
 class BoxProblem(_Problem):
     """Limited forces f and slips v: f = q - M v, lower <= f <= upper; v >= 0 at upper, <= 0 at lower, otherwise 0.
 
-    If M is a P-matrix, there is exactly one solution for every q. If minors are zero but none is negative, as for an
-    environment without a connection to ground, f is still unique. Then the enumeration skips singular active sets, and
-    pivoting regularises M.
+    If M is a P-matrix, there is exactly one solution for every q. If M is symmetric and only positive semidefinite, as
+    for an environment without a connection to ground, f is still unique. The enumeration skips singular active sets,
+    and pivoting regularises M.
 
     Raises:
         SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.
@@ -222,7 +222,9 @@ def _within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BallProblem(_Problem):
-    """Forces f limited as vectors: f = q - M v is in a product of balls, with v an outward normal on a sphere, else 0.
+    """Forces f = q - M v that are limited as vectors: each vector of f is in its ball.
+
+    v is 0 for a vector inside its ball, and an outward normal for a vector on the sphere.
 
     The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
     diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in

@@ -32,7 +32,7 @@ from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, in_band, rms_mismatch
 
-#: share of the damping that the condition at sampled frequencies leaves unused, for violations between them
+#: share of the damping in reserve at sampled frequencies, because the condition may be violated between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m] bounds of K in the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
@@ -62,7 +62,7 @@ class SampledLoop:
     delta is that of `even_damping`. The unknowns of the condition's multiplier follow the 2m gains.
     """
 
-    #: indices of the channels with a multiplier and a second row in the block; KnownDeviceLoop: indices of all devices
+    #: indices of the channels with a multiplier, each with one more row of the block; KnownDeviceLoop: of all devices
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
@@ -231,7 +231,7 @@ class SampledLoop:
         """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
 
         The eigenvalue is in units of delta/T. The Schur complement is that of the lower right part, which is diagonal
-        and positive. v is the eigenvector, followed by the entries of the lower rows that minimise the block's form.
+        and positive. v is the eigenvector, extended by those entries of the lower rows that minimise v* block v.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -315,7 +315,7 @@ class SwitchingLoop(SampledLoop):
 
     def __init__(self, loop: Loop) -> None:
         if loop.environment.walls or loop.latency:
-            raise ValueError("gains for switching delays are designed for linear environments without latency only")
+            raise ValueError("gains for switching delays need an environment without walls, and a loop without latency")
         self.active = np.flatnonzero(np.subtract(loop.delays.hi, loop.delays.lo))
         self.lead, self.shared = _shared(loop)
         self.unit = np.array(loop.per_channel(loop.per_device(even_damping(loop)).tolist())) / loop.T
@@ -346,7 +346,7 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """The loop with limited forces: x = (log K, B/delta, c), with the limiter's weight c_1 of each channel as c."""
+    """The loop with limited forces: x = (log K, B/delta, c), where c has one weight of the limiter per channel."""
 
     bounds = (0.0, 5.0)
     _first = 0.5  # first value of c
@@ -374,14 +374,15 @@ class LimiterLoop(SampledLoop):
 
 
 class KnownDeviceLoop(SampledLoop):
-    """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each device).
+    """The loop on known devices: x = (log K, B/delta, log(beta/largest beta) of each device).
 
     The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch), where
-    `device_rows` returns l11, l21, l22. The left side is the Schur complement of the speeds' rows in known-device.
+    `device_rows` returns l11, l21 (twice the entry 21) and l22. The left side is the block of known-device after its
+    rows of speeds are eliminated.
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # first value of beta over its largest value; the least mismatch hardly depends on beta
+    _first = 0.35  # first value of beta/(largest beta); the least mismatch hardly depends on beta
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE

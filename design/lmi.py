@@ -151,7 +151,7 @@ def reachability_scaled(G: Lti) -> Array:
         warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
         try:
             W = scipy.linalg.solve_discrete_lyapunov(A, W)
-        except scipy.linalg.LinAlgWarning:  # Then A^k B B' A'^k is summed; each step doubles the number of terms.
+        except scipy.linalg.LinAlgWarning:  # ill-conditioned: sum A^k B B' A'^k; each step doubles the terms
             while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)

@@ -29,14 +29,13 @@ def named(option: str, text: str) -> Any:
     to sys.path, so that the file and worker processes can import modules from it.
 
     Raises:
-        InputError: The text is not FILE.py:NAME, or one of its names has other characters than letters, digits and _;
-            the file or the object in it does not exist; the file is not valid Python or exits; or its name is that of
-            a loaded module that is not a user's file.
+        InputError: The text is not FILE.py:NAME with identifiers of Python for FILE and NAME; the file or the object
+            does not exist; the file is not valid Python or exits; or a loaded module of another origin has its name.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)
     if file.suffix != ".py" or not (file.stem.isidentifier() and name.isidentifier()):
-        raise InputError(f"{option} is {text!r}, expected FILE.py:NAME; both names have only letters, digits and _")
+        raise InputError(f"{option} is {text!r}, expected FILE.py:NAME with identifiers of Python")
     if not file.is_file():
         raise InputError(f"{option} is {text!r}: there is no file {place}")
     with redirect_stdout(sys.stderr):

@@ -17,12 +17,12 @@ from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)  # [Hz] default band of the mismatch
-_LATEST = 0.45  # [1/T] A band that begins above this frequency is too narrow for the grids of sweeps and of the bound.
+_LATEST = 0.45  # [1/T] A band that begins above this is too narrow for the grids of sweeps and of design.bound.
 _ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
 
 
 def in_band(band_hz: Sequence[float], T: float) -> tuple[float, float]:
-    """Return the ends of a band [Hz] in rad/sample, at most pi. Raises TypeError or InputError for no band."""
+    """Return the ends of a band [Hz] in rad/sample, at most pi. Raises TypeError or InputError for anything else."""
     expected = f"two rising frequencies in Hz, the first above 0 and below {_LATEST / T:.6g}"
     of_kind("band_hz", band_hz, Sequence, expected)
     band = [2 * np.pi * T * number("band_hz", frequency, expected) for frequency in band_hz]
@@ -70,7 +70,7 @@ class Transparency:
         if self.relative_mismatch == 0:
             return "the devices feel the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
-            return "some motion of the object takes no static force, and tau (25) divides by the least force"
+            return "some motion of the object meets no static force, so that tau (25) divides by zero"
         return None
 
     def part(self) -> dict[str, Any]:

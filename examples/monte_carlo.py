@@ -14,7 +14,8 @@ def meet(name: str, scenario: Scenario, coupling: Design | None) -> int:
     unstable = int((findings.exact > 0).sum())
     worst = int(np.argmax(findings.exact))
     most = betaincinv(unstable + 1, HANDS - unstable, 0.95) if unstable < HANDS else 1.0  # limit by Clopper and Pearson
-    print(f"{name}: {unstable} of {HANDS} unstable; at most {100 * most:.1f} % of all such hands are (95 % confidence)")
+    limit = f"at most {100 * most:.1f} % of all such hands (95 % confidence)"
+    print(f"{name}: {unstable} of {HANDS} hands unstable; {limit}")
     print(f"  the worst one: {findings.exact[worst]:+.3f} 1/s at {findings.frequency[worst]:.1f} Hz (index {worst})")
     return unstable
 

@@ -114,9 +114,9 @@ def expm_each(matrices: _Array) -> _Array:
 def _units(A: _Array, h: float) -> _Array:
     """Return units (nsim, states) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    The unit of the second half of the states (without impedances, the velocities) is a rate near that of the fastest
-    mode. For a stiff plant the norm of h A is then about this rate times h, and the exponential has a rounding error of
-    1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
+    The second half of the states are velocities, unless the plant has impedances. Their unit is a rate near that of the
+    fastest mode. For a stiff plant the norm of h A is then about this rate times h, and the exponential has a rounding
+    error of 1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
@@ -141,7 +141,8 @@ _Which = NDArray[np.intp]
 def product_of(matrices: _Array) -> Product:
     """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
 
-    Many matrices split into independent blocks, such as a device with its human; entries outside them are not used.
+    A stack of matrices is split into independent blocks, such as a device with its human. All entries outside the
+    blocks are 0.
     """
     if matrices.ndim == 2:
         return np.ascontiguousarray(matrices).dot

@@ -72,7 +72,7 @@ def prove_limiter(loop, coupling, beta=environments.BETA, c=None, swept=None):
 
 
 def _lagging(rho, lags):
-    """Return the condition for forces limited with rho [N/m], with `lags` multipliers c per channel."""
+    """Return the condition of a limiter with this rho [N/m] and `lags` weights c per device."""
     return environments.LimitedForces(lags=lags, held=tuple(float(r) for r in rho))
 
 

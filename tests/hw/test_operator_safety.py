@@ -73,8 +73,8 @@ def test_holding_the_deadman_continues_the_session(scenario, rungs):
     assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
 
 
-def test_the_last_test_needs_the_deadman(scenario, rungs):
-    """The last sign of a person comes at full gain, and 1 s later the motors are being tested for the last time."""
+def test_a_release_ends_the_last_motor_test(scenario, rungs):
+    """A person gives signs until full gain. The motor test at the end has begun 1 s later, and stops there."""
     rehearsal = rehearsal_of(
         scenario, rungs, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
     )
@@ -86,7 +86,7 @@ def test_the_last_test_needs_the_deadman(scenario, rungs):
 
 
 def test_fast_free_handles_are_announced():
-    """A force F moves a handle with damping b at F/b; at the radius r of a wheel a torque r F moves it at r^2 F/b."""
+    """A force F moves a free handle at F/b; a torque r F moves the rim of a wheel at r^2 F/b, with b in N m s/rad."""
     three, wheel = load("three-rigid"), load("omega-pair").replace(unit="rad", radius=0.2)
     assert "axis 2 moves at up to 1.62 m/s: --force-cap 0.8 " in bridge._fast_handle(three, [1.3] * 3)
     assert bridge._fast_handle(three, [0.8] * 3) is None
@@ -159,7 +159,7 @@ def test_sessions_have_low_default_limits(scenario):
 
 
 def test_the_identified_speed_limits_sessions(scenario):
-    """The speed that hw.identify wrote is the session's default limit, and no option exceeds it."""
+    """A speed from hw.identify below 0.7 m/s is the default limit of a session, and --max-speed cannot raise it."""
     slow = scenario.replace(device=tuple(replace(d, credible_speed=0.5) for d in scenario.device))
     assert limits_from(_parser().parse_args(["--rehearse"]), slow)["speed"] == 0.5
     assert limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.4"]), slow)["speed"] == 0.4
@@ -209,8 +209,8 @@ def rehearsal_until_finished(scenario, rungs):
 
 
 @pytest.mark.parametrize(("by_cap", "advice"), [(True, "raise --force-cap"), (False, "Raise --energy-budget")])
-def test_a_second_of_cut_forces_counts(scenario, rungs, by_cap, advice):
-    """A session has not finished if cap or energy account cut over half of the 833 ticks of any second."""
+def test_a_second_of_cut_forces_is_no_finish(scenario, rungs, by_cap, advice):
+    """A session ends as stopped if cap or budget reduced the forces in over half of the 833 ticks of any second."""
     session = rehearsal_until_finished(scenario, rungs)
     for cut, stage in ((400, "finished"), (450, "stopped")):
         recorder, state = Recorder(2), session.link.last
@@ -272,7 +272,7 @@ def test_the_incident_log_survives_sigkill(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
+def test_the_incident_log_grows_every_second(scenario, rungs, tmp_path):
     log = IncidentLog(tmp_path / "log")
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
     log.attach(rehearsal.session)
@@ -284,7 +284,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     standing = [line for line in lines if "gain" in line]
     assert len(standing) >= 2
     assert 2 in [len(line["x_m"]) for line in standing]
-    again = IncidentLog(tmp_path / "log")  # the log continues the file
+    again = IncidentLog(tmp_path / "log")  # A second log appends to the file.
     again.attach(Session(scenario, SafetyLimits((2.0, 2.0))))
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):
@@ -292,23 +292,23 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
 
 
 def test_figures_that_cannot_be_printed_are_stored(tmp_path, monkeypatch):
-    """Standard output is on a full disk, and the session's folder is on another one."""
+    """Printing fails because the disk of standard output is full; the session's folder is on a disk with space."""
 
     def full(*shown):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(bridge, "_print_session", full)
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # The command replaces it.
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # The command replaces it, and monkeypatch restores it.
     words = "--rehearse --duration 0.1 --measure 60 --coupling moving-average --no-plot --out"
     with pytest.raises(OSError, match="No space left"):
         bridge.main([*words.split(), str(tmp_path)])
-    sys.stdout.close()  # the null device
+    sys.stdout.close()  # This is the null device, which the command has opened.
     assert {path.name for path in tmp_path.iterdir()} == {"incidents.jsonl", "report.json", "trace.csv", "trace.npz"}
 
 
 @pytest.mark.slow
-def test_doubts_reach_report_and_incident_log(tmp_path, capsys):
-    """At a cap of 0.05 N, forces are cut for most of a second: report and incident log state the same doubt."""
+def test_report_and_incident_log_name_one_cause(tmp_path, capsys):
+    """A cap of 0.05 N cuts most forces, so that the session ends as stopped."""
     words = "--rehearse --force-cap 0.05 --duration 1.5 --measure 60 --out"
     assert bridge.main([*words.split(), str(tmp_path)]) == 1
     report = json.loads((tmp_path / "report.json").read_text())["session"]

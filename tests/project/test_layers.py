@@ -18,7 +18,7 @@ FOLDERS = ("models", "controller", "design", "sim", "hw", "cli")
 
 #: A folder may import itself and these folders.
 MAY_IMPORT = {
-    "models": {"controller"},  # linear systems, the bound of their real part, and the bounds of devices
+    "models": {"controller"},  # Lti, the lower bound of its Hermitian part, and DeviceBounds
     "controller": set(),
     "design": {"controller"},
     "sim": {"models", "controller", "design"},
@@ -59,14 +59,14 @@ def _nodes(path: Path) -> list[ast.AST]:
     return list(ast.walk(_tree(path)))
 
 
-#: names of conditions, with which only the files AT_HOME may compare
+#: names of conditions, with which only the files of EXEMPT may compare
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
 EXEMPT = ("design/conditions", "design/environments", "design/result")
 
 
 @pytest.mark.slow
-def test_no_code_compares_names_of_conditions():
-    """A user's own condition works in every command, since no code decides by a condition's name."""
+def test_only_exempt_files_compare_names_of_conditions():
+    """A user's own condition works in every command, since only EXEMPT files decide by a condition's name."""
     comparisons = []
     for path in FILES:
         place = path.relative_to(ROOT).as_posix().removesuffix(".py")
@@ -81,7 +81,7 @@ def test_no_code_compares_names_of_conditions():
 
 @cache
 def imported(path: Path) -> set[str]:
-    """Return the full names of all modules that a file imports, at its head, later or by a string."""
+    """Return the modules that a file imports anywhere, or by import_module(".."), without the prefix haptic_loop."""
     names = set()
     for top in _tree(path).body:
         for node in () if is_main_block(top) else ast.walk(top):
@@ -107,7 +107,7 @@ def file_of(name: str) -> Path | None:
 
 
 def all_imports() -> list[tuple[str, str]]:
-    """Return (file, full name of a module that it imports), for all files."""
+    """Return (file, module that it imports, without the prefix haptic_loop), for all files."""
     return [(path.relative_to(ROOT).as_posix(), name) for path in FILES for name in sorted(imported(path))]
 
 
@@ -149,7 +149,7 @@ def between_files() -> dict[str, set[str]]:
     arrows = {}
     for path in FILES:
         targets = {file_of(name) for name in imported(path) if name.split(".")[0] in FOLDERS} - {None, path}
-        # a package's __init__.py has only a docstring, or imports for type checkers only
+        # The __init__.py of a folder has only a docstring.
         arrows[str(path.relative_to(ROOT))] = {str(t.relative_to(ROOT)) for t in targets if t.name != "__init__.py"}
     return {name: after for name, after in arrows.items() if not name.endswith("__init__.py")}
 

@@ -1,4 +1,4 @@
-"""`default_substeps` picks enough substeps; the one-period map of an engine checks this, up to rounding."""
+"""Check by the one-period maps of engines that `default_substeps` picks enough substeps."""
 
 import json
 
@@ -77,7 +77,7 @@ def test_wrong_default_steps_are_doubled_or_refused():
     assert default_substeps(loop, "Euler") == 4
     with pytest.raises(InputError, match="discrete gives no reliable verdict"):
         default_substeps(loop, "discrete")
-    # The loop is just unstable, which Euler's bias towards stable hides at 4 substeps.
+    # The loop is barely unstable. With 4 substeps the numerical damping of Euler's method makes it look stable.
     near = assemble(SCENARIO.replace(delta=(1.55, 1.55)), NoCoupling())
     assert 0 < exact_growth(near) < 0.4
     assert default_substeps(near, "Euler") > 4
@@ -95,7 +95,7 @@ def test_unstable_steps_are_refused_with_advice():
 
 @pytest.mark.parametrize(("integrator", "edge"), [("RK4", 2.828), ("Euler", 2.0), ("implicitfast", 2.0)])
 def test_stable_regions_end_at_the_textbooks_edge(integrator, edge):
-    """Two masses of 1 kg on an almost undamped spring become unstable within 1 % of the textbook's mode times step."""
+    """The textbook limits the product of mode and step; two masses on a spring meet the limit within 1 %."""
     device = CompliantDevice(transmission_stiffness=1e4, motor_mass=1.0, handle_mass=1.0, damping=0.0, delta=None)
     human = Human((Link(0.0, 0.0, 0.0),))
     loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2, T=0.02), PUBLISHED["I"])
