@@ -43,6 +43,7 @@ from haptic_loop.design.exact import (
     refuted_rows,
     rows_of,
 )
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import CONDITIONS, NotProved, Requirement, refusal, switching_guarantee
@@ -123,6 +124,7 @@ def prove(
     return certificate
 
 
+_FORKED = 40  # least number of states of a block whose proof takes longer than the start of a second process
 _made: set[str] = set()  # seals of certificates that this process has proved or verified for the package's conditions
 
 
@@ -143,10 +145,22 @@ def _proof(
         each = [required_damping(loop.at(m.network), coupling, condition) for m in members if len(members) > 1]
         place = condition.place(loop, f"P{worst(each) if each else ''}")
         raise NotProved(_placed(place, requirement.shortfall), requirement)
-    if reason := _another_system(loop, coupling):
+    blocks = _blocks(loop, coupling, condition, requirement.multiplier)
+    large = any(block.order > _FORKED for block in blocks.values())
+    system = Forked(_another_system, loop, coupling) if large else None
+    if not system and (reason := _another_system(loop, coupling)):
         raise NotProved(reason, requirement)
+    try:
+        return requirement, _matrices(condition, loop, requirement, blocks)
+    finally:  # A system that rounding changes is the first reason to name.
+        if system and (reason := system.result()):
+            raise NotProved(reason, requirement)
+
+
+def _matrices(condition: Condition, loop: Loop, requirement: Requirement, blocks: Mapping[str, Lti]) -> dict[str, Rows]:
+    """Return the matrices that prove the blocks. Raises NotProved."""
     proof: dict[str, Rows] = {}
-    for name, real in _blocks(loop, coupling, condition, requirement.multiplier).items():
+    for name, real in blocks.items():
         try:
             budgets.require_size(real.order)
         except TooLong as error:
@@ -157,7 +171,7 @@ def _proof(
             refuted = isinstance(reason, Violated)
             raise NotProved(f"{condition.place(loop, name)}{reason}; {share}", requirement, refuted)
         proof[name] = rows_of(P)
-    return requirement, proof
+    return proof
 
 
 def _placed(place: str, reason: str) -> str:

@@ -63,7 +63,8 @@ class Forked(Generic[_Result]):
 
     def _compute(self, writer: int) -> NoReturn:  # pragma: no cover - runs in the second process
         """Send the pickled result to `writer` and end, without output and without the first process's files."""
-        code = 1
+        global allowed
+        code, allowed = 1, False
         try:
             import ctypes
 

@@ -320,6 +320,17 @@ def test_realisations_changed_by_rounding_are_refused(condition):
     assert reason.startswith("rounding may change the forces by ")
 
 
+@pytest.mark.parametrize("least", [0, 10**6])
+def test_second_processes_refuse_rounding(least, monkeypatch):
+    """A large proof and the check of rounding are computed at the same time, with the same verdicts."""
+    monkeypatch.setattr("haptic_loop.design.forked.allowed", True)
+    monkeypatch.setattr("haptic_loop.design.certificate._FORKED", least)
+    loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
+    assert verify(certified(loop, cancelling(1.0), "this-environment")).proved
+    with pytest.raises(NotProved, match="rounding may change the forces by"):
+        prove(loop, cancelling(1000.0), "this-environment")
+
+
 def test_the_bound_on_rounding_holds_over_ticks():
     """By Parseval's theorem, each error of 200 forces is at most `rounding` times the norm of x.
 
