@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     set_unit(stored.loop.unit)
-    with options.refused(f"{args.coupling}: "):
+    with options.refused(f"{args.coupling}: "), render.progress("proving the coupling again"):
         own = named(args.condition) if args.condition else None
         anew = own is not None and not (stored.certificate and stored.certificate.condition == own.name)
         stored, verdict = _anew(stored, own) if own and anew else (stored, verify(stored, own))
@@ -87,7 +87,8 @@ def main(argv: list[str]) -> int:
     checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
-    assessment = _assessed(stored, own, searched) if verdict.proved else None
+    with render.progress("assessing the coupling"):
+        assessment = _assessed(stored, own, searched) if verdict.proved else None
     checked = replace(checked, anew=anew, assessment=assessment)
     shown = verdicts.verdict(assessment) if assessment else f"[red]Not proved[/]: {verdict.reason}"
     render.publish(args, checked, [_table(checked)], verdict=shown)

@@ -69,7 +69,8 @@ def main(argv: list[str]) -> int:
     set_unit(stored.loop.unit)
     own = name_and_own(args.condition)[1]
     try:
-        verdict = verify(stored, args.condition and named(args.condition))
+        with render.progress("proving the coupling again"):
+            verdict = verify(stored, args.condition and named(args.condition))
     except (ValueError, ArithmeticError) as error:
         verdict = Verdict(False, str(error))
     claim = own.claim if own and verdict.proved else None

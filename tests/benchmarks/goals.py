@@ -61,7 +61,10 @@ LONG = {
     **dict.fromkeys((f"{MANY} {ROOT}/benchmarks/loops/{name}.toml" for name in ("n6-star4-II", "n7-eight-I")), 29.0),
 }
 #: commands whose first line comes before their end -> goal in floors, of wall time
-FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/optimal.json": 6.4}
+FIRST = {
+    "sim.run --case I --out {} --json {}/r.json": 2.5,
+    "design --coupling optimal --out {}/optimal.json --json {}/r.json": 6.4,
+}
 
 
 def engines() -> Iterator[Sequence[str]]:
@@ -190,7 +193,7 @@ def long() -> Iterator[Sequence[str]]:
 
 
 def first() -> Iterator[Sequence[str]]:
-    yield "first line of", "wall [s]", "floors", "goal", ""
+    yield "first line of", "wall [s]", "floors", "goal", "error or proof"
     yield from interleaved(FIRST, first_line, 5)
 
 
