@@ -32,7 +32,7 @@ from haptic_loop.sim.couplings import NAMES, encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
-_FAST = 1.0  # [m/s] speed of a free handle above which the bridge advises a smaller force cap
+_FAST = 1.0  # [m/s] If a free handle can be faster at the force cap, the bridge advises a smaller cap.
 _LONGEST = 3600.0  # [s] largest --duration (time at full gain after arming), because the trace is kept in memory
 
 

@@ -169,7 +169,7 @@ def _sitting(
     number: int,
     clamped: float | None = None,
 ) -> _Sitting:
-    """Play the excitation to every axis, record the motion and estimate the parameters.
+    """Apply the exciting forces to every axis, record its motion, and estimate its parameters.
 
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """

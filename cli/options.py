@@ -310,6 +310,7 @@ def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str
 
 
 def pair(text: str) -> tuple[float, float]:
+    """Parse two numbers separated by a comma. Raises ArgumentTypeError."""
     numbers = _parts(text, float, expected := "two numbers separated by a comma")
     if len(numbers) != 2:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")

@@ -130,6 +130,7 @@ def publish(
 def show(
     args: argparse.Namespace, tables: Iterable[Table], lines: Iterable[str] = (), details: Iterable[str] = ()
 ) -> None:
+    """Print tables and lines, and with --details the details."""
     screen = console(args)
     for table in tables:
         screen.print(table)
@@ -326,6 +327,7 @@ def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
 
 
 def delay_rows(part: VaryingDelays) -> Rows:
+    """Yield the rows on delays that vary."""
     span, met, proof = part.span, part.met, part.certified.switching
     ranges = ", ".join(f"{lo} to {hi}" for lo, hi in zip(span.lo, span.hi, strict=True))
     played = ", played out at the largest" if span.playout else ""

@@ -44,6 +44,7 @@ _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "s
 
 
 def add_link_options(parser: options.Parser) -> None:
+    """Add the options of the link between host and device."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
@@ -83,6 +84,7 @@ def add_output_options(parser: options.Parser, picture: bool = False) -> None:
 
 
 def add_safety_options(parser: options.Parser) -> None:
+    """Add the options that limit forces and motions, and the dead-man switch."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force of a device (default 1.3, for first sessions); if it is rotary, at the radius of the hand"
     add("--force-cap", type=number(0.05, 12.0), default=1.3, metavar="NEWTON", help=cap)

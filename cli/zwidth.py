@@ -169,7 +169,9 @@ def _rows(report: MapReport) -> render.Rows:
         yield from _designed_rows(report.fixed)
     for name in report.conditions:
         error = (report.error or {}).get(name)
-        near = f"; its edge is within {100 * error.edge_relative_in_K:.2g} % in K of single sweeps" if error else ""
+        near = (
+            f"; separate sweeps move its edge by at most {100 * error.edge_relative_in_K:.2g} % in K" if error else ""
+        )
         yield f"certified, {name}", f"{_share(report.ratios[name].certified_cells, report)}{near}"
     stable = f"{_share(crowd.stable_cells, report)} ({crowd.decided_cells} cells decided)"
     yield f"stable with all of {crowd.humans} random humans", stable

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # number of intervals of [0, pi] at the start
-#: most evaluations in a search with up to 8 states (half a second), two per interval; fewer for more states
+#: largest number of evaluations for up to 8 states, which take half a second; more states are allowed fewer
 _EVALUATIONS = 1 << 15
 _REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|(zI - A)^-1|
 _UNIT = 2.0**-53  # largest relative error of one rounding

@@ -33,7 +33,7 @@ class _Kind(NamedTuple):
     options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether designs try by default to cover limited forces
-    for_less_damping: bool = False  # whether designs may be repeated for less damping for a user's own condition
+    for_less_damping: bool = False  # whether a user's own condition may request further designs, for less damping
 
 
 KINDS = {

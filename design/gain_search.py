@@ -38,7 +38,7 @@ SOFTEST, STIFFEST = 1.0, 1e6  # [N/m] bounds of K in the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
 _STUCK = 1e-3  # A search that ends with a larger violation than this is given up.
 FEW = 12  # largest number of channels for which steps are cheap
-_ROUGH = 0.01  # Gains that violate the condition by more are sorted last.
+_ROUGH = 0.01  # If gains violate the condition by more than this, the search tries them last.
 _DIFFERENCE = 1e-7  # step of finite differences in x
 
 

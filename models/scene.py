@@ -55,8 +55,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 
 _Array = NDArray[np.floating[Any]]
 
-#: MuJoCo's friction lets a held device creep. A device of 0.25 kg with 0.3 N of friction, pushed by half of it, creeps
-#: at 1e-7 m/s with these parameters, and at 6e-4 m/s with MuJoCo's defaults.
+#: In MuJoCo a device creeps although friction holds it. With 0.25 kg, 0.3 N of friction and a push of 0.15 N it creeps
+#: at 1e-7 m/s with these parameters, and at 6e-4 m/s with the defaults of MuJoCo.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies

@@ -25,7 +25,7 @@ class Parsed(Exception):
 
 
 def modules():
-    """Return the modules of all commands, as python -m names them."""
+    """Return the module names of all commands, such as sim.run."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
     texts = {path: path.read_text() for path in files}
     entries = [path for path in files if ENTRY.search(texts[path]) or LAUNCH.search(texts[path])]

@@ -1,4 +1,4 @@
-"""Energy budgets bound the energy of hands for any controller, and never act in any-environment loops."""
+"""Energy budgets bound the energy of hands, and limit no force in loops that any-environment certifies."""
 
 from itertools import product
 

@@ -402,7 +402,11 @@ def test_guarantees_name_the_environment_that_runs():
 
 SPRING = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
 ALONE = Loop(1.2e-3, (1,), (0,), (0,), (1.37,), SPRING)
-FEW_TRIALS = ("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)  # a short search between vertices
+FEW_TRIALS = (
+    ("RANGE_ALONG", (2, 2)),
+    ("RANGE_DRAWN", 0),
+    ("RANGE_STARTS", 1),
+)  # This makes the search between vertices short.
 
 
 @pytest.mark.slow

@@ -688,7 +688,7 @@ def test_the_stiffest_spring_damper_meets_its_known_limit():
     """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid are certified."""
     loop = one(1.2e-3, 1.37)
     optimum = design_coupling(loop, "spring-damper", "known-device-any")
-    assert optimum.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # the design leaves 0.1 % of the damping unused
+    assert optimum.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # The design uses 99.9 % of the damping.
     assert optimum.coupling.B[0] == pytest.approx(7.352, rel=1e-2)
     assert prove(loop, optimum.coupling, "known-device-any").proof == "rational"
     z = np.exp(1j * np.linspace(1e-3, np.pi, 500))

@@ -239,7 +239,9 @@ def test_switching_over_ranges_is_guaranteed_for_ranges(ranged):
         RANGES,
         ("switching", "ranges", "limiter"),
     )
-    assert assessment.requirements["switching"].ratio < ranged.required[0] / 1.37  # in the nominal environment
+    assert (
+        assessment.requirements["switching"].ratio < ranged.required[0] / 1.37
+    )  # This is for the nominal environment.
     less = change(RANGED, delta=(1.09, 1.09))
     assert required_damping(less, SOFT, "this-environment").ratio > 1
 

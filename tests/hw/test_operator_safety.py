@@ -74,7 +74,7 @@ def test_holding_the_deadman_continues_the_session(scenario, rungs):
 
 
 def test_a_release_ends_the_last_motor_test(scenario, rungs):
-    """A person gives signs until full gain. The motor test at the end has begun 1 s later, and stops there."""
+    """A person gives no sign after full gain. 1 s later, during the last motor test, the session stops."""
     rehearsal = rehearsal_of(
         scenario, rungs, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
     )

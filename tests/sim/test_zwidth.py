@@ -309,7 +309,7 @@ def test_sustained_oscillations_are_told_from_decays():
     assert judged.sustained.tolist() == [verdict for _, verdict in cases]
     # An octave's amplitude is that of the sinusoid in it; the relative error was 1e-7 in the middle of an octave.
     assert judged.amplitude[0] == pytest.approx(1e-4, rel=0.02)
-    assert judged.frequency_hz[0] == pytest.approx(40, abs=1)  # the spectrum's lines are 1.3 Hz apart
+    assert judged.frequency_hz[0] == pytest.approx(40, abs=1)  # The spectrum has a resolution of 1.3 Hz.
     assert np.isinf(judged.amplitude[-1])
     assert slowest_seen(4.0) == 4.0
 
