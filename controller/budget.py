@@ -77,30 +77,15 @@ class BudgetFigures(ShellFigures):
     idle: str | None = None  # reason why the budget never acts, if that is proved
 
 
-class _Acting:
-    """Counts, for every simulation, the ticks in which a passivity layer changes the force."""
-
-    def __init__(self, nsim: int) -> None:
-        self.ticks = 0
-        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was changed
-
-    def _act(self, acted: ArrayLike) -> None:
-        self.ticks += 1
-        self.limited += np.asarray(acted)
-
-    def figures(self, guarantee: str | None = None) -> NetFigures:
-        """Return the counts of the simulation in which the layer acted most."""
-        return NetFigures(guarantee=guarantee, ticks=self.ticks, limited_ticks=int(self.limited.max()))
-
-
-class _Net(_Acting):
-    """Common part of `EnergyBudget` and `Shell`: W of every simulation, its cap, and the smallest scale of a force."""
+class _Net:
+    """Common part of `EnergyBudget` and `Shell`: W of every simulation, its cap, and counts of limited forces."""
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
-        super().__init__(nsim)
         check_start("W0", start)
         if not start <= cap:
             raise ValueError(f"the budget's cap is {cap:g} J, expected at least its start, {start:g} J")
+        self.ticks = 0
+        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was changed
         self.energy = np.full(nsim, float(start))  # (nsim,) W [J]
         self.least = np.ones(nsim)  # (nsim,) the smallest scale so far
         self._start, self._cap = float(start), float(cap)
@@ -110,13 +95,16 @@ class _Net(_Acting):
 
     def _count(self, scale: Array, spoilt: NDArray[np.bool_]) -> None:
         scale = np.where(spoilt, 0.0, scale)
-        self._act(scale < 1)
+        self.ticks += 1
+        self.limited += scale < 1
         np.minimum(self.least, scale, out=self.least)
 
     def figures(self, guarantee: str | None = None) -> ShellFigures:
         """Return the present W, the least scale so far, and the limited ticks, each the worst of all simulations."""
         return ShellFigures(
-            **vars(super().figures(guarantee)),
+            guarantee=guarantee,
+            ticks=self.ticks,
+            limited_ticks=int(self.limited.max()),
             start_J=self._start,
             cap_J=self._cap if np.isfinite(self._cap) else None,
             smallest_scale=float(self.least.min()),
