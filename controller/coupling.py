@@ -85,7 +85,7 @@ class Coupling:
     def turned(self, Q: Array) -> Coupling:
         """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m).
 
-        Raises ValueError for a class of couplings that cannot be turned, and for springs with filtered dampers.
+        Raises ValueError for a class of couplings that cannot be turned.
         """
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
@@ -129,22 +129,17 @@ class NoCoupling(Coupling):
 class SpringDamper(ReadOnly, Coupling):
     """One spring and damper per channel: V = [K + B (z-1)/(Tz)]^-1, (26) of the paper.
 
-    K and B are (m,), or (.., m) for many couplings at once.
-
-    The damper may act on a filtered velocity. Its force is then the backward Euler discretisation of B s/(1 + s/a) with
-    a = 2 pi cutoff: a damper in series with a spring of stiffness a B, and therefore passive. In this case
-    1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with beta = 1/(1 + a T).
+    K and B are (m,), or (..., m) for many couplings at once.
     """
 
     K: Array  # (..., m) [N/m]
     B: Array  # (..., m) [N s/m]
-    cutoff: float | None = None  # [Hz] cut-off frequency of the velocity filter; None without filter
 
     kind = "spring-damper"
 
     if TYPE_CHECKING:  # __post_init__ accepts more types than the fields have afterwards
 
-        def __init__(self, K: ArrayLike, B: ArrayLike, cutoff: float | None = None) -> None: ...
+        def __init__(self, K: ArrayLike, B: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         for name in "KB":
@@ -159,16 +154,11 @@ class SpringDamper(ReadOnly, Coupling):
             )
         if not ((self.B >= 0) & (self.B <= _LARGEST_COEFFICIENT)).all():
             raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 up to {_LARGEST_COEFFICIENT:g} N s/m")
-        if self.cutoff is not None and not 0 < self.cutoff < np.inf:
-            raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
     def channels(self, T: Number) -> list[Lti]:
         """Return V_i(z) of each channel. A channel without damper has no state."""
-        beta = self._beta(T)
-        return [
-            _spring_damper(k, b, beta, T)
-            for k, b in zip(np.moveaxis(self.K, -1, 0), np.moveaxis(self.B, -1, 0), strict=True)
-        ]
+        gains = zip(np.moveaxis(self.K, -1, 0), np.moveaxis(self.B, -1, 0), strict=True)
+        return [_spring_damper(k, b, T) for k, b in gains]
 
     def compliance(self, T: Number) -> Lti:
         """Return the diagonal V(z)."""
@@ -177,8 +167,7 @@ class SpringDamper(ReadOnly, Coupling):
     def __repr__(self) -> str:
         rows = [gains.tolist() if gains.ndim == 1 else None for gains in (self.K, self.B)]
         shown = [f"[{', '.join(f'{value:.6g}' for value in row)}]" if row else f"{self.K.shape}" for row in rows]
-        cutoff = "" if self.cutoff is None else f", cutoff={self.cutoff:g}"
-        return f"SpringDamper(K={shown[0]}, B={shown[1]}{cutoff})"
+        return f"SpringDamper(K={shown[0]}, B={shown[1]})"
 
     def figures(self, T: float) -> dict[str, Any]:
         return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
@@ -186,16 +175,13 @@ class SpringDamper(ReadOnly, Coupling):
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> SpringDamper:
         return replace(self, K=stiffness * self.K, B=damping * self.B)
 
-    def turned(self, Q: Array) -> Coupling:
-        if self.cutoff is not None:  # a matrix of springs and dampers has no velocity filter
-            return super().turned(Q)
+    def turned(self, Q: Array) -> _MatrixSpringDamper:
         K, B = (Q * gains @ Q.T for gains in (self.K, self.B))
         return _MatrixSpringDamper((K + K.T) / 2, (B + B.T) / 2)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
         """Return V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
-        beta, points = self._beta(T), np.asarray(z)[..., None]
-        rate = (1 - beta) / (1 - beta / points) * (1 - 1 / points) / T
+        rate = (1 - 1 / np.asarray(z)[..., None]) / T
         values = 1 / (self.K[..., None, :] + self.B[..., None, :] * rate)
         return Sampled(z, values[..., None] * np.eye(values.shape[-1]), T)
 
@@ -205,12 +191,7 @@ class SpringDamper(ReadOnly, Coupling):
         return super().around(environment, further)
 
     def form(self) -> _SpringDamperForm:
-        if self.cutoff is not None:
-            raise ValueError("a spring-damper with a velocity filter cannot be stored")
         return _SpringDamperForm(tuple(self.K.tolist()), tuple(self.B.tolist()))
-
-    def _beta(self, T: Number) -> Any:
-        return 0 if self.cutoff is None else 1 / (1 + 2 * np.pi * self.cutoff * T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,14 +240,14 @@ class _MatrixSpringDamper(ReadOnly, Coupling):
         return _MatrixSpringDamperForm(_rows(self.K), _rows(self.B))
 
 
-def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
+def _spring_damper(k: Array, b: Array, T: Number) -> Lti:
     """Return V(z) of one channel, or a stack of systems if k and b are arrays."""
-    stiffness, step = numbers(k, T), numbers(b, T) * (1 - beta) / T
-    gain = 1 / (stiffness + step)
+    step = numbers(b, T) / T
+    gain = 1 / (numbers(k, T) + step)
     if not np.any(b):
         return Lti.constant(_scalar(gain), T)
-    memory = gain * (stiffness * beta + step)
-    return Lti(_scalar(memory), _scalar(gain), _scalar(memory - beta), _scalar(gain), T)
+    memory = gain * step
+    return Lti(_scalar(memory), _scalar(gain), _scalar(memory), _scalar(gain), T)
 
 
 def _scalar(value: Any) -> Any:

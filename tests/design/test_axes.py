@@ -343,12 +343,6 @@ def test_longest_period_scales_matrix_levels() -> None:
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.1e-3 * largest, rel=1e-5)
 
 
-def test_filtered_spring_dampers_are_not_turned() -> None:
-    """Springs and dampers between axes have no velocity filter, so the turned coupling would lose it."""
-    with pytest.raises(ValueError, match="SpringDamper cannot be turned to other axes"):
-        SpringDamper([800.0, 900.0], [0.5, 0.5], cutoff=50.0).turned(np.eye(2))
-
-
 def turned(loop: Loop, Q: np.ndarray) -> Loop:
     """Return the loop in other coordinates; the orthogonal Q has rows of the contacts, then of the inner nodes."""
     m = loop.channels

@@ -32,7 +32,6 @@ NETWORK = Network(
 )
 COUPLINGS = (
     SpringDamper([1500.0, 900.0], [0.5, 0.8]),
-    SpringDamper([1500.0, 900.0], [0.5, 0.8], cutoff=30.0),
     MovingAverage([1e-4, 2e-4], (2, 3), [1e-4, 1e-4]),
 )
 

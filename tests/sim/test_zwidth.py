@@ -18,7 +18,7 @@ from shared import force_map, loop_of
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.execute import execute
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
-from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
@@ -174,17 +174,6 @@ def test_the_force_maps_are_those_of_single_couplings():
         F = force_map(E, SpringDamper([K[i]] * 2, [B[i]] * 2), (1, 2), (0, 1))
         # the free mass has two poles near z = 1, which cost seven digits
         np.testing.assert_allclose(stack[i].at(z), F.at(z), rtol=1e-8)
-
-
-def test_a_velocity_filter_is_a_series_spring():
-    """The filtered coupling is a spring beside a spring and damper in series, discretised by backward Euler."""
-    cutoff, K, B = 30.0, 900.0, 1.3
-    tau = 1 / (2 * np.pi * cutoff)
-    springs = (Spring(("tip", GROUND), K), Spring(("tip", "inner"), B / tau), Spring(("inner", GROUND), 0.0, B))
-    F = force_map(environment(Network(("tip",), springs), T), NoCoupling(), (1,), (0,))
-    z = on_circle(np.linspace(0.01, 3.1, 60))
-    V = SpringDamper([K], [B], cutoff).sampled(z[None], T)
-    np.testing.assert_allclose(1 / V.G[0, :, 0, 0], F.at(z)[:, 0, 0] * z, rtol=1e-9)
 
 
 def test_suprema_equal_those_of_a_dense_sweep():
