@@ -20,7 +20,7 @@ from haptic_loop import _leave
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.units import in_unit
-from haptic_loop.design.files import discard_output, one_command, one_line
+from haptic_loop.design.files import discard_output, lost_output, one_command, one_line
 from haptic_loop.design.own import is_refusal, place_of
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
@@ -75,6 +75,8 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         discard_output()
     except OSError as error:
         code = _cannot(error)
+    if lost_output:
+        code = _cannot(lost_output[0])
     # After a Ctrl-C within exec(), which dataclass() calls, Python would end by SIGINT unless exec() runs once more.
     exec("")
     sys.exit(code)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from haptic_loop.cli import options, render
-from haptic_loop.design.files import off_table, write_json
+from haptic_loop.design.files import check_file, off_table, write_json
 from haptic_loop.sim.scenario import InputError, is_world, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.view.session import (
     COUPLINGS,
@@ -45,16 +46,12 @@ _LONGEST = 3600  # [s] longest video
 def main(argv: list[str]) -> int:
     """Show the loop until the window is closed or --duration is over, or film it. Return 0, or 130 if interrupted."""
     args = _parser().parse_args(argv)
-    from haptic_loop.sim.view.stage import check_film
-
     scenario = options.scenario_from(args)
     require_even_ticks(scenario, "sim.view")
     require_constant_delay(scenario, "sim.view")
     require_linear(scenario, "sim.view", walls=True)
     if args.video:
-        check_film(Path(args.video))
-        if args.video.endswith(".gif") and 100 % args.fps:  # A GIF states times in hundredths of a second.
-            raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
+        _check_film(Path(args.video), args.fps)
     if is_world(scenario):
         args.coupling, args.duration = args.coupling or "moving-average", args.duration or scenario.duration
         args.script = args.script or "0:restart"
@@ -218,6 +215,17 @@ def _label(args: argparse.Namespace) -> str:
 def _names() -> list[str]:
     """Return the allowed names of couplings: those of other commands, and those of the window."""
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
+
+
+def _check_film(path: Path, fps: int) -> None:
+    """Raise InputError if a film cannot be written, before any work is done."""
+    if path.suffix not in (".gif", ".mp4"):
+        raise InputError(f"--video {path}: the name must end in .gif or .mp4")
+    check_file("--video", path)
+    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise InputError(f"--video {path}: MP4 requires ffmpeg, which is not on the PATH; install it or write a .gif")
+    if path.suffix == ".gif" and 100 % fps:  # A GIF states times in hundredths of a second.
+        raise InputError(f"--fps is {fps}, allowed for a .gif are the numbers that divide 100")
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:

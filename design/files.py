@@ -388,6 +388,9 @@ def write_json(destination: str | Path, report: Any) -> None:
         write(Path(destination), text)
 
 
+lost_output: list[OSError] = []  # errors of writing standard output, which `cli.execute` reports at the end
+
+
 def discard_output() -> None:
     """Discard further standard output, which cannot be written."""
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -9,7 +9,6 @@ MuJoCo renders the scene of a world in them. Pillow writes a GIF, and ffmpeg an 
 from __future__ import annotations
 
 import copy
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -29,7 +28,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.units import PositionUnit, in_unit
-from haptic_loop.design.files import InputError, check_file, write
+from haptic_loop.design.files import InputError, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
 from haptic_loop.sim.view.drawn_object import SPRING, DrawnObject, object_of
@@ -530,7 +529,6 @@ def _typed(session: LiveLoop) -> Callable[[int], None]:
 # ----------------------------------------------------------------------------------------------------
 # Films: their pictures, and the file.
 
-_FORMATS = (".gif", ".mp4")
 _COLOURS = 48  # number of colours in a GIF, which keeps the file small
 _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
@@ -707,15 +705,6 @@ def _offscreen(width: int, height: int) -> Any:
 def _rgb(parts: _Colour) -> tuple[int, int, int]:
     red, green, blue = (round(255 * part) for part in parts)
     return red, green, blue
-
-
-def check_film(path: Path) -> None:
-    """Raise InputError if a film cannot be written, before any work is done."""
-    if path.suffix not in _FORMATS:
-        raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
-    check_file("--video", path)
-    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise InputError(f"--video {path}: MP4 requires ffmpeg, which is not on the PATH; install it or write a .gif")
 
 
 def save_film(path: Path, pictures: Iterable[Picture], fps: float) -> int:

@@ -59,3 +59,13 @@ def test_files_that_would_wait_end_in_an_error():
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert ended.returncode == 1
     assert "InputError" in ended.stderr.splitlines()[-1]
+
+
+def test_files_are_complete_without_standard_output(tmp_path):
+    words = ["-m", "sim.run", "--duration", "0.1", "--out", str(tmp_path)]
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run([sys.executable, *words], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert ended.returncode == 2
+    assert ended.stderr == "error: standard output: No space left on device\n"
+    stored = {path.name for path in tmp_path.iterdir()}
+    assert stored == {"figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"}

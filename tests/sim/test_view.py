@@ -7,6 +7,7 @@ precision.
 import contextlib
 import json
 import math
+import subprocess
 import sys
 import threading
 from concurrent.futures import Executor, Future
@@ -706,6 +707,19 @@ def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
         assert image.n_frames == 4
 
 
+@pytest.mark.parametrize("option", ["--scenario", "--coupling"])
+def test_bad_files_are_refused_before_mujoco_loads(option, tmp_path):
+    bad = tmp_path / "bad.json"
+    bad.write_text("{")
+    code = (
+        "import sys; from haptic_loop.cli import view\n"
+        "try: view.main(sys.argv[1:])\n"
+        "except ValueError: print('mujoco' in sys.modules)"
+    )
+    words = [sys.executable, "-c", code, option, str(bad)]
+    assert subprocess.run(words, capture_output=True, text=True, timeout=60).stdout == "False\n"
+
+
 def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
     """A stand-in for ffmpeg copies its input, which must be every picture in order."""
     tool = tmp_path / "ffmpeg"
@@ -715,7 +729,7 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     pictures = np.random.default_rng(3).integers(0, 255, (3, 480, 640, 3), dtype=np.uint8)
-    drawing.check_film(tmp_path / "a.mp4")
+    command._check_film(tmp_path / "a.mp4", 10)
     assert drawing.save_film(tmp_path / "a.mp4", iter(pictures), 10) == 3
     assert (tmp_path / "a.mp4").read_bytes() == pictures.tobytes()
     tool.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('no codec')\n")
