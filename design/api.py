@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
 
+from haptic_loop.controller.arguments import known, of_kind, one_of, shown
 from haptic_loop.controller.arithmetic import one_blas_thread
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
-from haptic_loop.design.arguments import known, of_kind, one_of, shown
 from haptic_loop.design.assessment import Assessment, check_ranges
 from haptic_loop.design.certificate import judged, limiter_rho, named, prove, requirements_of
 from haptic_loop.design.conditions import Condition

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from haptic_loop.controller.arguments import number, of_kind, whole
 from haptic_loop.controller.arithmetic import SingularLoop, one_blas_thread
 from haptic_loop.controller.budget import START_J, check_start
 from haptic_loop.controller.coupling import Coupling, require_channels
@@ -23,7 +24,7 @@ from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member, inside, number_of_vertices, where_proved
-from haptic_loop.design.arguments import number, of_kind, whole
+from haptic_loop.design import budgets
 from haptic_loop.design.certificate import (
     condition_of,
     is_ours,
@@ -50,7 +51,6 @@ from haptic_loop.design.environments import (
     worst,
 )
 from haptic_loop.design.files import InputError
-from haptic_loop.design.frequency import too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice, described
 from haptic_loop.design.result import (
     ANY,
@@ -804,7 +804,7 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
         F, E = loop.F(coupling), loop.E()
     except ValueError:  # A rigid wall or a world has no E(z), and a singular loop has no F.
         return None
-    if too_long(F) or silent(E):
+    if budgets.too_long(F) or silent(E):
         return None
     try:
         return transparency(F, E, loop.lam, band_hz)

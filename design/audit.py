@@ -20,13 +20,13 @@ import numpy as np
 from haptic_loop.controller.arithmetic import TooLong
 from haptic_loop.controller.coupling import Coupling, SpringDamper
 from haptic_loop.controller.loop import Loop
+from haptic_loop.design import budgets
 from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import conditions_of, named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.forked import Forked
-from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.necessary import LeftOver, left_over
 from haptic_loop.design.own import place_of
@@ -438,9 +438,9 @@ def _in_time(
 ) -> _Result:
     """Return the result of a search by many sweeps, or `without(reason)` if it takes too long."""
     try:
-        if reason := too_long(loop.F(coupling), _SWEEPS):
+        if reason := budgets.too_long(loop.F(coupling), _SWEEPS):
             return without(f"not searched: {reason}")
-        with sweeping():
+        with budgets.sweeping():
             return search()
     except TooLong as error:
         return without(str(error))

@@ -9,7 +9,10 @@ an AMD EPYC, 2.4 GHz.
 
 from __future__ import annotations
 
-from haptic_loop.controller.arithmetic import TooLong
+from contextlib import AbstractContextManager
+
+from haptic_loop.controller.arithmetic import TooLong, within
+from haptic_loop.controller.lti import Lti
 
 # Work that is counted [units] -----------------------------------------------------------------------------------------
 
@@ -80,8 +83,6 @@ CENTRING_STEPS, CONE_STEPS = 60, 60
 #: divides the condition number by as much. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after
 #: them (1).
 DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
-#: Rounds of halving the intervals of an integral (3), and intervals that are halved in one round.
-INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
 #: Blocks of 256 ticks of an impulse response that are summed. Only a time constant above 250,000 ticks needs them all.
 GAIN_CHUNKS = 20_000
 
@@ -90,3 +91,26 @@ def require_size(states: int) -> None:
     """Raise TooLong for a proof over more than PROOF_STATES states."""
     if states > PROOF_STATES:
         raise TooLong(f"a proof over {states} states takes long: up to {PROOF_STATES} are tried")
+
+
+_POINTS_SWEPT = 3000  # approximate number of points in a grid and its refinement
+_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured time of a response per inputs x states^2, of a Schur form per states^3
+
+
+def too_long(G: Lti, sweeps: int = 1) -> str | None:
+    """Return the reason why this many sweeps of G, or of a system of its size, are refused, or None.
+
+    Delays at the outputs of G cost no time.
+    """
+    n, m = G.inner_order, G.inputs
+    seconds = sweeps * (_POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR)
+    if seconds <= SWEEPS:
+        return None
+    how = f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
+    too_slow = f"{how} over {n} states and {m} channels would take about {seconds:.0f} s, allowed are {SWEEPS:g} s"
+    return f"{too_slow}: use a smaller psi, or fewer channels or masses"
+
+
+def sweeping() -> AbstractContextManager[None]:
+    """Return a context with the budget of a search by sweeps; TooLong is raised in it when the budget is spent."""
+    return within(SWEEPS, "a search by sweeps", "many states or channels")

@@ -11,12 +11,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from haptic_loop.controller.arguments import of_kind
 from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, within
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop, forget_exact
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import budgets
-from haptic_loop.design.arguments import of_kind
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
     Certificate,
@@ -161,10 +161,6 @@ def _matrices(condition: Condition, loop: Loop, requirement: Requirement, blocks
     """Return the matrices that prove the blocks. Raises NotProved."""
     proof: dict[str, Rows] = {}
     for name, real in blocks.items():
-        try:
-            budgets.require_size(real.order)
-        except TooLong as error:
-            raise NotProved(str(error), requirement) from None
         P, reason = find_storage(real)
         if P is None:
             share = f"the sweep requires {requirement.ratio:.9f} of the available damping"
@@ -494,13 +490,18 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: An
 
 
 def _block(demand: Demand[Lti]) -> Lti:
-    """Return the block of a demand at the available damping. Raises NotProved if a static matrix fails its test."""
+    """Return the block of a demand at the available damping.
+
+    Raises NotProved if a static matrix fails its test, and TooLong for a block that is too large to be proved.
+    """
+    block = demand.gain + demand.free
+    budgets.require_size(block.order)
     for name, value in demand.static.items():
         if not (value == value.T).all():
             raise NotProved(f"{name} is not exactly symmetric")
         if name in demand.semidefinite and not (outcome := definiteness(Matrix.of(value))).semidefinite:
             raise NotProved(f"{name} is not positive semidefinite: {outcome}")
-    return demand.gain + demand.free
+    return block
 
 
 def conditions_of(loop: Loop) -> tuple[Condition, ...]:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from haptic_loop.controller.arguments import shown
 from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers, positive_definite
 from haptic_loop.controller.complementarity import magnitudes
 from haptic_loop.controller.coupling import Coupling
@@ -32,7 +33,6 @@ from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_l
 from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
-from haptic_loop.design.arguments import shown
 from haptic_loop.design.facts import Demand, compose, even_damping, even_level
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import (
@@ -45,7 +45,6 @@ from haptic_loop.design.frequency import (
     rounding,
     suprema,
     supremum,
-    too_long,
 )
 from haptic_loop.design.result import ANY, HERE, RANGES, Environments, Requirement, from_ratio, refusal
 
@@ -401,7 +400,7 @@ def unsound(system: Lti, delta: Sequence[float]) -> str | None:
     """Return the reason why no sweep of a block with the poles of this system can certify a loop, or None."""
     if min(delta) == 0:
         return "a device guarantees no damping, so no coupling is safe for every passive human"
-    if reason := too_long(system):
+    if reason := budgets.too_long(system):
         return reason
     radius = float(np.abs(system.poles()).max(initial=0.0))
     return f"the map F or V has a pole at radius {radius:.6f}, on or outside the unit circle" if radius >= 1 else None
@@ -490,7 +489,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(V) or (phi is not None and too_long(loop.E())):
+    if reason := budgets.too_long(V) or (phi is not None and budgets.too_long(loop.E())):
         return refused(reason)
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")

@@ -62,7 +62,6 @@ from haptic_loop.design.frequency import (
     on_circle,
     peaks,
     supremum,
-    sweeping,
 )
 from haptic_loop.design.lmi import RESERVE, Ports, balanced, lemma1, packed, symmetric_from, unit_environment
 from haptic_loop.design.result import (
@@ -140,7 +139,7 @@ class Multiplied(Condition):
         if not self.unknowns(loop):
             return super().required(loop, coupling)
         try:
-            with sweeping():
+            with budgets.sweeping():
                 return self.required_of(self.map(loop, coupling), loop, multiplier)
         except InputError:
             raise

@@ -23,11 +23,10 @@ from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
+from haptic_loop.controller.arguments import shown
 from haptic_loop.controller.arithmetic import Number, numbers, rational, times
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Lti, Sampled, as_like, constant_like, vstack
-from haptic_loop.design import budgets
-from haptic_loop.design.arguments import shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +286,6 @@ class Collected(Generic[Block]):
             silent = Lti.constant(np.zeros((inner, inner), dtype=int), T) if G is None else G
             through = Lti.diag(silent, Lti.constant(np.eye(rest, dtype=int), T)) @ into
         signals = as_like(through, lines) @ through
-        if isinstance(signals, Lti) and signals.is_exact:
-            budgets.require_size(signals.order)
         static, regular = signals.over_z_minus_one()
         count = signals.G.shape[-2] if isinstance(signals, Sampled) else signals.outputs
         sums: Any = numbers(np.zeros((n, count), dtype=int), T) + 0

@@ -14,12 +14,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from haptic_loop.controller.arguments import of_kind, whole
 from haptic_loop.controller.coupling import Compliance, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets, lmi, spring_damper
-from haptic_loop.design.arguments import of_kind, whole
 from haptic_loop.design.conditions import any_environment_demand
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import ANY_ENVIRONMENT, least_phi

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.controller.arithmetic import spend, within
+from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Lti, frozen
-from haptic_loop.design import budgets
 
 _ERROR = 1e-6  # allowed relative error of an integral
+_HALVINGS, _HALVED = (
+    20,
+    1000,
+)  # most rounds of halving (3 in the designs of cases I and II), and intervals halved in one
 _ROUNDING = 1e-20  # Smaller means count as 0: rounding causes them in squared differences of nearly equal responses.
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
@@ -28,15 +30,15 @@ def integral(response: Callable[[Array], Array], grid: Array) -> float:
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
     coarse, settled = _gauss(response, left, right), 0.0
-    for _ in range(budgets.INTEGRAL_ROUNDS):
+    for _ in range(_HALVINGS):
         middle = (left + right) / 2
         first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
         fine = first + second
         share = max(_ERROR * (settled + fine.sum()) / length, _ROUNDING) * (right - left)
         excess = np.abs(fine - coarse) - share
         rough = excess > 0
-        if rough.sum() > budgets.INTEGRAL_INTERVALS:
-            rough &= excess > np.sort(excess)[-budgets.INTEGRAL_INTERVALS - 1]
+        if rough.sum() > _HALVED:
+            rough &= excess > np.sort(excess)[-_HALVED - 1]
         settled += fine[~rough].sum()
         left, right = np.append(left[rough], middle[rough]), np.append(middle[rough], right[rough])
         coarse = np.append(first[rough], second[rough])
@@ -120,31 +122,7 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
     return common, np.clip(near, _LOWEST, np.pi)
 
 
-_POINTS_SWEPT = 3000  # approximate number of points in a grid and its refinement
-_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured time of a response per inputs x states^2, of a Schur form per states^3
 _POINT = 1.5e-6  # [s] measured time of the eigenvalues at a point of a sweep
-
-
-def _sweep_cost(G: Lti) -> float:
-    """Estimate the time [s] of a sweep of a large G; delays at the outputs of G cost nothing."""
-    n, m = G.inner_order, G.inputs
-    return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
-
-
-def too_long(G: Lti, sweeps: int = 1) -> str | None:
-    """Return the reason why this many sweeps of G, or of a system of its size, are refused, or None."""
-    seconds, how = sweeps * _sweep_cost(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
-    if seconds <= budgets.SWEEPS:
-        return None
-    states = f"{G.inner_order} states and {G.inputs} channels"
-    fewer = "a smaller psi, or fewer channels or masses"
-    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g} s: use {fewer}"
-
-
-def sweeping() -> AbstractContextManager[None]:
-    """Return a context with the budget of a search by sweeps; TooLong is raised in it when the budget is spent."""
-    return within(budgets.SWEEPS, "a search by sweeps", "many states or channels")
-
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 

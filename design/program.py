@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.controller.arguments import number, one_of
 from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.coupling import ForceFilter, basis
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.design import budgets
-from haptic_loop.design.arguments import number, one_of
 from haptic_loop.design.barrier import (
     EntryInequality,
     MatrixInequality,

@@ -25,7 +25,7 @@ from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, least_phi, stiffest_alpha
 from haptic_loop.design.facts import Latency, PeriodCost
 from haptic_loop.design.forked import Forked
-from haptic_loop.design.frequency import on_circle, peaks, too_long
+from haptic_loop.design.frequency import on_circle, peaks
 from haptic_loop.design.gain_search import (
     FEW,
     KnownDeviceLoop,
@@ -324,7 +324,7 @@ def _for_this_environment(
     If `limiter` is not False, it covers limited forces, or with None those below the limits if no such gains are found.
     """
     each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
-    if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
+    if reason := budgets.too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
         raise DesignFailed(None, (), reason)
     started, starts = time.perf_counter(), starts or _default_starts(loop)
     band = band_hz or BAND_HZ

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.controller.arguments import number, of_kind
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
-from haptic_loop.design.arguments import number, of_kind
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 

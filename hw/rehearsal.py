@@ -13,10 +13,10 @@ from functools import partial
 from itertools import count
 from typing import NamedTuple
 
+from haptic_loop.controller.arguments import number, of_kind, whole
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.api import COUPLING, bare
-from haptic_loop.design.arguments import number, of_kind, whole
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.result import Design
 from haptic_loop.hw.boards import Boards

@@ -9,11 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from haptic_loop.controller.arguments import number, of_kind, one_of, shown, whole
 from haptic_loop.controller.arithmetic import one_blas_thread
 from haptic_loop.controller.budget import START_J
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.arguments import number, of_kind, one_of, shown, whole
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import Chosen, Design
 from haptic_loop.sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
