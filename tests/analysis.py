@@ -1,4 +1,4 @@
-"""Check Theorem 4 of the paper, (c) in docs/theory.md, for a coupling by an LMI. Numbers in () are paper equations."""
+"""Check by an LMI whether a coupling satisfies Theorem 4, (c) in docs/theory.md. (n) is an equation of the paper."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from haptic_loop.design.lmi import (
 
 
 def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
-    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T."""
+    """Return V in units in which T = 1 and Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T."""
     root = np.sqrt(np.asarray(delta))
     return Lti(V.A, V.B * root, root[:, None] / V.T * V.C, root[:, None] / V.T * V.D * root, 1.0)
 
@@ -51,7 +51,7 @@ def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
 
 
 def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
-    """Return the matrix of (14), positive if the excess of devices (I) and V-hat covers the shortage Phi of E-hat."""
+    """Return the matrix of (14). If positive, the excess of devices (I) and V-hat covers the shortage Phi of E-hat."""
     return symmetric([[np.eye(Phi.shape[0]) - Phi, -Phi], [-Phi, Delta_V - Phi]])
 
 

@@ -2,11 +2,11 @@
 
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|imports|long|peers ..]
 
-`cold` measures commands to their end, `first` to their first line, `long` commands of many seconds, and `imports` what
-`python -X importtime` says of the commands of `cold`. Times are CPU seconds; those of cold and first are wall seconds,
-which need an idle machine. Ratios are medians of rounds in which the compared programs alternate. Commands alternate
-with the floor, a process that only imports NumPy and MuJoCo; their goals are multiples of the floor's time. `--write`
-puts the table of cold into docs/accuracy.md.
+`cold` measures commands until they end, and `first` until they print a line. Both give wall seconds and need an idle
+machine; all other times are CPU seconds. `long` measures commands of many seconds, and `imports` the imports of the
+commands of `cold` (`python -X importtime`). Ratios are medians of rounds in which the compared programs alternate.
+Commands alternate with the floor, a process that only imports NumPy and MuJoCo. Goals are multiples of the floor's
+time. `--write` puts the table of cold into docs/accuracy.md.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PAGES = {"cold": "docs/accuracy.md"}
 ROUNDS = 9
 FLOOR = "-c import numpy, mujoco"
 
-#: words of a command -> goal in floors; {} is a folder that all commands share
+#: words of a command -> its goal, as a multiple of the floor's time; {} is a folder that all commands share
 COMMANDS = {
     **{
         f"{name} --help": 1.0 for name in ("sim.run", "design", "design.audit", "sim.validate", "hw.bridge", "sim.view")
@@ -52,7 +52,7 @@ COMMANDS = {
     "sim.run --case I --out {} --json {}/r.json": 4.0,
 }
 MANY = "design --coupling optimal --out {}/many.json --json {}/r.json --scenario"  # four and eight devices
-#: commands of many seconds, which run once -> goal in floors
+#: words of a command that takes many seconds and runs once -> its goal, as a multiple of the floor's time
 LONG = {
     "sim.validate --humans 1000 --no-plot --out {} --json {}/r.json": 7.3,
     "sim.validate --humans 1000 --no-plot --traces all --out {} --json {}/r.json": None,
@@ -60,7 +60,7 @@ LONG = {
     "design --coupling optimal --out {}/optimal.json --json {}/r.json": None,
     **dict.fromkeys((f"{MANY} {ROOT}/benchmarks/loops/{name}.toml" for name in ("n6-star4-II", "n7-eight-I")), 29.0),
 }
-#: commands whose first line comes before their end -> goal in floors, of wall time
+#: words of a command that prints a line before its end -> its goal, as a multiple of the floor's wall time
 FIRST = {
     "sim.run --case I --out {} --json {}/r.json": 2.5,
     "design --coupling optimal --out {}/optimal.json --json {}/r.json": 6.4,
@@ -100,9 +100,9 @@ def engines() -> Iterator[Sequence[str]]:
 
 
 def started(words: str, folder: str, *flags: str) -> subprocess.Popen[bytes]:
-    """Start the command in a new process, with bytecode and matplotlib's list of fonts, as for a user.
+    """Start the command in a new process that finds bytecode and matplotlib's font cache, as a user's process does.
 
-    `flags` are Python's; with any, the process keeps its standard error.
+    `flags` are options of Python; if there are any, standard error is piped.
     """
     environment = os.environ | {"MPLCONFIGDIR": matplotlib.get_cachedir(), "PYTHONPATH": str(ROOT)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -19,7 +19,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
-#: errors of the bounds of an earlier fit (one mass with Coulomb friction, by output error); it refused other rigs
+#: rig -> error of its bound by a fit of one mass with Coulomb friction; that fit refused the other rigs
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")
@@ -27,7 +27,7 @@ BASE = ("viscous", "mass", "motor", "spring", "step")
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig with its imperfections: each is ideal at zero, or at infinity for `thin`."""
+    """A rig with its imperfections. An imperfection of 0 is absent, and `thin` is absent at infinity."""
 
     name: str
     viscous: float = 1.0  # [N s/m] the true guarantee
@@ -37,13 +37,13 @@ class Rig:
     loss: float = 0.5  # [N s/m] of the transmission
     step: float = 5e-6  # [m] encoder
     coulomb: float = 0.0  # [N]
-    slip: float = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+    slip: float = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of `coulomb`
     static: float = 0.0  # [N] static friction above Coulomb friction
     stribeck: float = 0.02  # [m/s] speed at which `static` is down to 1/e
     thin: float = np.inf  # [m/s] speed at which the viscous coefficient is down to a half
     memory: float = 0.0  # [N s/m] dashpot of a Maxwell element
     relax: float = 1.0  # [s] time constant of the Maxwell element
-    drag: float = 0.0  # [N s2/m2]
+    drag: float = 0.0  # [N s2/m2] drag that grows with the square of the speed
     bristle: float = 0.0  # [N/m] presliding (Dahl's law) in place of tanh
     constant: float = 0.0  # [N] constant force
     drift: float = 0.0  # [N/s] rate of a growing force
@@ -150,7 +150,7 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
             link = k * contact + (free | (contact != 0)) * d * (v - w)
             z = np.minimum(np.maximum(z + h * v, -reach), reach)
             dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / stribeck) ** 2))))
-            wound = wound + h * (v - wound / relax)  # [m] of the Maxwell element's spring
+            wound = wound + h * (v - wound / relax)  # [m] extension of the Maxwell element's spring
             total = felt + outside - link - v * (b / (1 + speed / thin) + drag * speed)
             total = total - remembered * wound - dry - cable * x + cogging * np.sin(turns * x + phase[1])
             v = v + pushes * total

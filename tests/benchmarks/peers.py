@@ -2,13 +2,13 @@
 
 PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (pip install drake control)
 
-Every tool simulates the default scenario with the published coupling of case I: same process, force limits, outside
-forces and plant. The tools alternate, and the median of a tool's CPU times counts. Growth is measured on the tool's
-trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1".
+Every tool simulates the default scenario with the published coupling of case I. Process, force limits, external forces
+and plant are the same. The tools alternate, and the median of a tool's CPU times counts. Growth is measured on the
+tool's trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1".
 
-Drake has a MultibodyPlant of prismatic joints, with springs as bushings; the forces of a period are an applied
-generalised force, because its discrete controllers in Python cost more. python-control has the sampled plant as a
-nonlinear discrete system, because only that can clip. scipy.signal has the closed loop without clipping.
+Drake simulates a MultibodyPlant of prismatic joints, with springs as bushings. Forces are applied as generalised
+forces, because discrete controllers in Python slow Drake down. python-control simulates the sampled plant as a
+nonlinear discrete system, because linear systems cannot clip. scipy.signal simulates the closed loop without clipping.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from haptic_loop.sim.stability import MARGINAL, _measured_growth, close, dominan
 from haptic_loop.sim.trace import Trace
 
 States = tuple[Array, Array, Array]  # process states (N, order), plant states (N, 2n), forces (N, m)
-Peer = Callable[[Simulation, Array], States]  # from rest, under outside forces (N, outside)
+Peer = Callable[[Simulation, Array], States]  # runs from rest under external forces (N, outside)
 
 
 def ours(engine: str, integrator: str | None = None, substeps: int | None = None) -> Peer:

@@ -77,7 +77,7 @@ def test_audit(benchmark):
 
 @pytest.mark.parametrize("devices", [1, 2, 4, 8])
 def test_audit_of_devices_with_three_axes(benchmark, devices):
-    """Devices with full levels touch one block. The ratio of any-environment does not depend on their number."""
+    """Devices with full matrices as levels touch one block. Any-environment has one ratio for any number of devices."""
     level, tips = "[[1.5, 0.4, 0.1], [0.4, 1.2, -0.2], [0.1, -0.2, 1.2]]", [f"tip {i}" for i in range(devices)]
     springs = [f'{{ between = ["{tip}", "block"], stiffness = 300.0, damping = 0.5 }}' for tip in tips]
     text = f'name = "star"\nT = 1e-3\ntheta = {[1] * devices}\n'

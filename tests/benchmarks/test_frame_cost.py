@@ -62,7 +62,7 @@ def test_decode_one_frame_a_call(benchmark, sample, axes):
 
 
 def test_device_tick(benchmark):
-    """An armed device receives a FORCE, ticks and sends a STATE: the emulator's cost per period."""
+    """Measure the emulator's cost per period: an armed device receives a FORCE, ticks and sends a STATE."""
     info = Info(1, "bench", 1, 1_200_000, (1,) * 2, (1,) * 2, (1,) * 2, (24_000,) * 2, (8000,) * 2)
     device = Device(info)
     device.receive(encode(Config(1, 4, 4, 0, (24_000,) * 2, (48_000,) * 2)), 0)

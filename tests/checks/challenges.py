@@ -1,7 +1,7 @@
 """Attack guarantees for limited forces, budgets, walls and encoder steps, as a part of `make validate`.
 
-A loop is drawn; its devices get a little more or much less damping (or friction) than its guarantee requires. Then two
-adversaries try to take energy out of the loop, from rest. One moves the devices: by waves, by noise, and at every tick
+The devices of a random loop get a little more or much less damping (or friction) than its guarantee requires. Then two
+adversaries try to take energy out of the loop, from rest. One moves the devices by waves, by noise, and at every tick
 by the step that takes the most energy. The other draws pushed lossless hands, selects those whose motion grows most,
 and varies them. A guarantee says that the energy balance
 
@@ -121,7 +121,7 @@ def _challenge(
 
 
 def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int) -> Array:
-    """Return steps [m] of waves and noise in three sizes (ticks, m, _PUSHED), which with greed end after 150 ticks."""
+    """Return steps [m] (ticks, m, _PUSHED) of waves and noise in three sizes; with greed they end after 150 ticks."""
     w, phase = np.exp(rng.uniform(-5, 1.1, (1, 1, _PUSHED))), rng.uniform(0, 6, (1, m, _PUSHED))
     wave = np.sin(w * np.arange(ticks)[:, None, None] + phase) + 0.3 * rng.normal(size=(ticks, m, _PUSHED))
     until = ticks if greed == 0 else 150
@@ -255,7 +255,7 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
     """Return a case of any-environment: a limiter with rho = 0, and walls with dampers that make and break contact.
 
-    Of eight loops it has the environment that needs the largest share of the damping that any-environment requires.
+    Among eight random loops it takes the one whose own environment needs the largest share of that damping.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:
@@ -301,7 +301,7 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _friction(rng: np.random.Generator, factor: float) -> _Case:
-    """Return a case of encoder steps of 10 um: the factor applies to friction; damping is that for ideal encoders."""
+    """Return a case of encoder steps of 10 um. The factor applies to friction; damping is as for ideal encoders."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop).required)

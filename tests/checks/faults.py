@@ -64,7 +64,7 @@ class Fault:
     free: bool = False  # nobody holds the handles, and the session knows it
     shown: bool = False  # a person moves each axis in its + direction before arming
     deadman: bool = False  # forces act only while the dead-man switch at the device is held
-    period: float = 1.0  # one tick by the device's clock, in T
+    period: float = 1.0  # [T] duration of a tick by the device's clock
     lasts: float = _LASTS  # [s] from arming to the end of the case
 
 
@@ -477,7 +477,7 @@ def _rehearse_case(
 
 
 def begins_late(case: Fault) -> bool:
-    """Return whether nothing happens in a case before LATE, so that it begins as `CASES[0]` or with free handles."""
+    """Return whether a case equals `CASES[0]` until LATE; its handles may be free."""
     late = replace(case, name=CASES[0].name, stage=A, cause="", faults=(), within=None, action=None, counted=())
     same = replace(late, acts=_WHEN, host_stall=0.0, lasts=_LASTS, free=False) == CASES[0]
     return same and all((FaultInjection.parse(text).start or 0.0) > LATE for text in case.faults)

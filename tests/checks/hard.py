@@ -1,4 +1,4 @@
-"""Numerically hard loops, each with an integrator setting that holds and, but for one loop, a setting that fails.
+"""Numerically hard loops. Each has an integrator setting that holds and, except in one loop, a setting that fails.
 
 The rule is `default_substeps`, which picks the substeps of an integrator.
 """

@@ -1,8 +1,8 @@
 """Check three laws on random loops: `make validate`.
 
-An exact proof succeeds if the sweep requires less damping than is available, and only then. The verdict of a simulated
-trace never contradicts the eigenvalues; if nothing excites the deciding mode, the verdict says so. On a slow loop a
-trace of a crowd counts only if its rate is larger than its error, and then agrees with the eigenvalues.
+An exact proof succeeds if and only if the sweep requires less damping than is available. The verdict of a simulated
+trace never contradicts the eigenvalues; if nothing excites the deciding mode, the verdict says so. In a slow loop with
+fifty hands, a trace counts only if its growth rate exceeds the rate's error; then it agrees with the eigenvalues.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ PAIRS, TICKS = 50, 500
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
-    """Hands gain at most W0 and the energy that the scene released, at delays of 0 to 3 samples."""
+    """Hands gain at most the energy budget W0 plus what the scene released, at delays of 0 to 3 samples."""
     rng, acted, worst = np.random.default_rng(7), 0, -np.inf
     for run in range(PAIRS):
         loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))
@@ -33,7 +33,7 @@ def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_without_gravity_fifty_pairs_stay_within_the_account(name, lossless):
-    """Hands, devices and bodies of the scene gain at most W0 and the energy that springs released."""
+    """Hands, devices and bodies of the scene gain at most the budget W0 plus what springs released."""
     rng = np.random.default_rng(8)
     for run in range(PAIRS):
         loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))

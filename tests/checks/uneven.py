@@ -4,9 +4,9 @@ Each loop has one or two devices, a random spring-damper and a random network. T
 this-environment requires for periods up to T_max, for forces that latch late, or for both. Lossless hands start with
 random speeds, all else at rest. The adversary chooses the tick that leaves hands and devices most mechanical energy.
 
-With ENOUGH damping this energy may never exceed that at the start. The work of the forces plus the least dissipation
-delta a^2/tau_max + delta b^2/(T_max - tau_min), with the motions a and b before and after the latch of each tick and
-latencies from tau_min to tau_max, may never be negative.
+With ENOUGH damping this energy may never exceed that at the start. Nor may the work of the forces plus the least
+dissipation delta a^2/tau_max + delta b^2/(T_max - tau_min) be negative. Here a and b are the motions before and after
+the latch of each tick, and latencies are between tau_min and tau_max.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _run(
     ticks: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
-    """Return the largest and the last energy, over the first, and the least balance of each set of `hands`.
+    """Return for each set of `hands` the largest and the last energy, both over the first, and the least balance.
 
     `hands` are masses, devices included, and stiffnesses, both (hands, m).
     """

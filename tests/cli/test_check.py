@@ -68,7 +68,7 @@ def test_help_has_an_example(capsys):
 
 
 def test_checking_imports_no_solver(path):
-    """Designs use clarabel, and matrix expressions cvxpy."""
+    """Neither clarabel, which designs use, nor cvxpy, which matrix expressions use, is loaded."""
     code = f"import sys, cli.check as c; print(c.main([{str(path)!r}]), {{'clarabel', 'cvxpy'}} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "0 set()"

@@ -44,7 +44,7 @@ def test_each_coupling_has_its_guarantee_and_error(compared):
 
 
 @pytest.mark.slow
-def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
+def test_each_row_equals_a_run_with_its_coupling(compared, tmp_path):
     """The comparison uses the exact engine and the run uses MuJoCo; both report the same force error."""
     rows, _ = compared
     assert run_once(["--no-plot", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
@@ -57,7 +57,7 @@ def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
     ("name", "kinds"),
     [("one-wall", ["none", "spring-damper", "spring-damper"]), ("omega-pair-ranges", ["none", "spring-damper"])],
 )
-def test_walls_and_ranges_leave_out_other_couplings(tmp_path, name, kinds):
+def test_only_couplings_that_permit_the_environment_are_compared(tmp_path, name, kinds):
     rows = compare(tmp_path, "--scenario", name, "--no-plot")
     assert [row["coupling"] for row in rows] == kinds
 
@@ -67,13 +67,13 @@ def test_conditions_need_named_couplings(tmp_path):
         main(["--condition", "any-environment", "--out", str(tmp_path)])
 
 
-def test_the_stiffest_coupling_is_nearest_without_force_errors():
+def test_stiffness_ranks_couplings_whose_force_errors_are_unknown():
     rows = [Alternative("soft", None, "g", dc_ratio=0.3), Alternative("stiff", None, "g", dc_ratio=0.9)]
     assert "stiff (g) is nearest to the object: 90 % of the stiffness" in _nearest(rows)
     assert _nearest([Alternative("soft", None, "g")]).startswith("No force error was measured")
 
 
-def test_a_row_shows_its_worst_channel():
+def test_each_row_shows_the_worst_channels_ratio():
     needs = Requirement("own", (1.0, 3.0), (2.0, 2.0), None)
     row = Alternative("soft", None, requirements={"own": needs, "never": replace(needs, required=(math.inf, 1.0))})
     assert [row.needs(name) for name in ("own", "never", "absent")] == [1.5, None, None]

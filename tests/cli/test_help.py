@@ -50,12 +50,12 @@ def help_of(module, capsys):
     return capsys.readouterr().out
 
 
-def test_the_commands_are_found():
+def test_every_file_with_a_command_is_found():
     assert {"design", "design.audit", "sim.run", "sim.validate", "hw.bridge"} <= set(modules())
 
 
 @pytest.mark.parametrize("module", modules())
-def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
+def test_commands_accept_the_examples_of_their_help(module, capsys, monkeypatch):
     text = help_of(module, capsys)
     lines = text.partition("\nexamples:\n")[2].splitlines()
     assert len(lines) == 2
@@ -73,7 +73,7 @@ def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("module", modules())
-def test_help_says_what_every_option_is(module, capsys, monkeypatch):
+def test_help_describes_every_option(module, capsys, monkeypatch):
     parse = Parser.parse_args
     seen = []
 
@@ -106,7 +106,7 @@ def count(*_):
     ["execute(count)", "api.known = count; design_coupling(load('omega-pair').loop('I'))"],
     ids=("command", "function"),
 )
-def test_commands_and_functions_compute_with_one_blas_thread(call):
+def test_commands_and_functions_use_one_blas_thread(call):
     """The last digits depend on the number of threads, so a user's OPENBLAS_NUM_THREADS=2 must change nothing."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "2"}
     words = [sys.executable, "-c", COUNT + call]

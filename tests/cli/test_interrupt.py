@@ -41,13 +41,13 @@ def interrupted_after(module, command, cwd):
     return process.returncode, lines
 
 
-def test_ctrl_c_while_the_solver_is_imported(tmp_path):
-    """The design imports the solver after the command has begun."""
+def test_ctrl_c_during_solver_import_exits_with_130(tmp_path):
+    """A design imports the solver while the command is at work."""
     assert interrupted_after("clarabel", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
 
 
 def test_an_interrupted_comparison_reports_nothing(tmp_path):
-    """The runs import MuJoCo after some couplings are designed."""
+    """Ctrl-C comes when the runs import MuJoCo; by then some couplings are designed."""
     assert interrupted_after("mujoco", ["design.compare", "--json", "r.json"], tmp_path) == (130, ["interrupted"])
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
@@ -85,7 +85,7 @@ def test_interrupted_secondary_runs_give_no_report(command, simulation, tmp_path
 
 
 @pytest.mark.parametrize("simulation", [1, 2])
-def test_interrupted_references_measure_nothing(simulation, tmp_path, monkeypatch):
+def test_an_interrupted_reference_run_leaves_no_measurements(simulation, tmp_path, monkeypatch):
     """The exact engine runs the loop without the coupling, and the loop with it, before any engine is measured."""
     interrupt(monkeypatch, simulation)
     assert finish(["sim.accuracy", *RUN[1:]], tmp_path) == 130
@@ -95,7 +95,7 @@ def test_interrupted_references_measure_nothing(simulation, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("scenario", [["--case", "none"], ["--scenario", "world-cube"]])
-def test_no_finished_tick_leaves_no_folder(scenario, tmp_path, monkeypatch):
+def test_runs_without_a_finished_tick_leave_no_folder(scenario, tmp_path, monkeypatch):
     interrupt(monkeypatch, 1, blocks=0)
     with pytest.raises(KeyboardInterrupt), one_command():
         finish(["sim.run", *scenario], tmp_path / "new/folder")
@@ -103,7 +103,7 @@ def test_no_finished_tick_leaves_no_folder(scenario, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_interrupted_runs_in_worlds_say_so(tmp_path, monkeypatch, capsys):
+def test_interrupted_runs_in_worlds_report_the_interruption(tmp_path, monkeypatch, capsys):
     interrupt(monkeypatch, 1)
     assert finish(["sim.run", "--scenario", "world-cube", "--duration", "3"], tmp_path) == 130
     assert json.loads((tmp_path / "report.json").read_text())["interrupted"]
@@ -251,11 +251,11 @@ IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise I
 @pytest.mark.parametrize(
     "command", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run", "cli run"]
 )
-def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
+def test_ctrl_c_during_command_imports_exits_with_130(command, tmp_path):
     assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
 
 
-def test_ctrl_c_before_enum_is_imported(tmp_path):
+def test_ctrl_c_before_enum_import_exits_with_130(tmp_path):
     """Without site, the package is the first to import enum: its handler must be there by then."""
     (tmp_path / "enum.py").write_text(INTERRUPT.replace("signal\n", "_signal as signal\n", 1))
     environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
@@ -267,7 +267,7 @@ def test_ctrl_c_before_enum_is_imported(tmp_path):
 @pytest.mark.parametrize(
     "code", [pytest.param(IN_EXEC, id="exec", marks=pytest.mark.slow), pytest.param(IN_C, id="compiled")]
 )
-def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
+def test_ctrl_c_during_mujoco_import_exits_with_130(code, tmp_path):
     # Case none has no coupling to design, so that MuJoCo is imported soon.
     command = "sim.run --case none --duration 0.05 --no-plot"
     assert interrupted_at(command, "mujoco", code, tmp_path) == (130, "interrupted\n")
@@ -305,7 +305,7 @@ execute(main, [])
 """
 
 
-def test_ctrl_c_during_a_clean_up_is_repeated():
-    """Python ignores the KeyboardInterrupt that __del__ raises."""
+def test_ctrl_c_inside_a_destructor_ends_the_command():
+    """Python ignores a KeyboardInterrupt that __del__ raises, so the command must notice Ctrl-C by other means."""
     done = subprocess.run([sys.executable, "-c", LOST], env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")

@@ -72,7 +72,7 @@ class Report:
     holds: bool = True
 
 
-def test_a_figure_is_a_field(capsys):
+def test_a_reports_field_defines_row_and_key(capsys):
     """A field's declaration sets its row in tables, and its name is the key in JSON."""
     reports = [Report("a", 1.0), Report("b", None, False)]
     assert list(render.rows_of(reports[0])) == [("loop", "a"), ("growth [1/s]", "+1.00")]

@@ -133,13 +133,13 @@ def test_wrong_rotary_fields_are_named(change, words):
         ("zwidth", ["--mark", "1e-9,1"], "N m/rad, B 0 to 1e6 N m s/rad"),
     ],
 )
-def test_refused_options_are_rotary(command, words, unit):
+def test_refusals_of_options_use_rotary_units(command, words, unit):
     with pytest.raises(InputError) as error:
         import_module(f"haptic_loop.cli.{command}").main(["--scenario", str(WHEEL), *words])
     assert unit in in_unit(str(error.value))
 
 
-def test_the_live_window_is_rotary():
+def test_the_live_window_has_rotary_units():
     """The window's thread takes the unit from the scenario, since no command has set it there."""
     figure = _figure(0, np.zeros((2, 1)), np.zeros((2, 1)), 1.0, load(WHEEL).unit)
     assert figure.title == "force on device 1 [N m]"

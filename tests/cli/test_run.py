@@ -39,7 +39,7 @@ def run(tmp_path, *options):
     return code, json.loads((tmp_path / "r.json").read_text())
 
 
-def test_case_none_is_figure_5(tmp_path):
+def test_case_none_reproduces_figure_5(tmp_path):
     code, report = run(tmp_path, "--case", "none", "--no-plot")
     stability = report["stability"]
     assert code == 0
@@ -270,7 +270,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
+def test_interrupted_runs_keep_the_simulated_blocks(tmp_path, monkeypatch):
     """After Ctrl-C in the third block the first two are written, and the exit code is 130."""
     block, calls = loop.run_block, []
 
@@ -375,7 +375,7 @@ def test_no_plot_removes_the_old_picture(tmp_path):
     assert str(picture) not in report["files"]
 
 
-def test_no_file_is_removed_if_one_was_read(tmp_path):
+def test_commands_remove_no_file_that_they_read(tmp_path):
     with one_command():
         path, other = tmp_path / "figure.png", tmp_path / "report.json"
         path.write_text("a scenario of this name")

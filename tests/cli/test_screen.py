@@ -28,7 +28,7 @@ def printed(table: Table, width: int) -> str:
 
 @pytest.mark.parametrize("width", [10, 30, 45, 60, 100])
 @pytest.mark.parametrize("fold", [True, False])
-def test_numbers_are_whole(width, fold):
+def test_narrow_tables_keep_every_digit(width, fold):
     table = Table("a name of a few words", *(f"heading {n}" for n in "abcde"), title="what it is")
     table.columns[0].overflow = "fold" if fold else "ellipsis"
     table.add_row("spring-damper:this-environment", *NUMBERS)

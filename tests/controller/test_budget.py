@@ -67,7 +67,7 @@ def each_in_turn(hands, rng):
 
 
 class Line:
-    """A link with varying delays and losses. It applies the newest packet, or 0 if this is older than hi + hold."""
+    """A link with varying delays and losses. It applies the newest packet, or 0 if that is over hi + hold ticks old."""
 
     def __init__(self, rng, lo, hi, hold, loss, nsim):
         self.rng, self.lo, self.hi, self.hold, self.loss = rng, np.array(lo), np.array(hi), hold, loss
@@ -88,7 +88,7 @@ class Line:
 
 
 def test_no_hand_is_given_more_than_the_budget():
-    """Each controller meets twenty hands of each kind: with or without losses, starting at 1 mm/s or at 0.3 m/s."""
+    """Each controller meets twenty hands of each kind: lossless or damped, with initial speeds of 1 mm/s or 0.3 m/s."""
     rng, n = np.random.default_rng(7), np.arange(240)
     lossless, start = n // 3 % 2 == 0, np.where(n // 6 % 2 == 0, 1e-3, 0.3)
     hands = Hands(rng, n.size, lossless, start)
@@ -180,13 +180,13 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, report):
         assert (hands.energy() - initial).max() <= W0 + 1e-9
         assert (budget.energy - budget.reserved > -1e-9).all()
     assert budget.surprises == 0
-    # If the budget never learns which forces acted, it stays empty for some hands; most hands get forces.
+    # Without reports the budget stays empty for some hands, but most hands get forces.
     assert (np.abs(acted).sum(axis=(0, 1)) > 0.1).mean() > 0.6
 
 
 @pytest.mark.parametrize("case", [pytest.param("constant", marks=pytest.mark.slow), "late"])
 def test_coarse_encoders_keep_the_guarantee(case):
-    """No hand receives more than W0. If the budget ignores steps of 0.5 mm, one receives over 1.5 W0."""
+    """No hand receives more than the budget W0. If encoder steps of 0.5 mm are ignored, one hand gets over 1.5 W0."""
     W0, q, most = 0.05, 5e-4, {}
     for known in (q, 0.0) if case == "constant" else (q,):
         rng = np.random.default_rng(17)
@@ -213,7 +213,7 @@ def test_coarse_encoders_keep_the_guarantee(case):
 
 @pytest.mark.parametrize("every", [1, 2])
 def test_encoder_errors_cost_their_worst_combination(every):
-    """The device reports every tick or every second one; the worst errors of +-q/2 are found among all combinations.
+    """The device reports every tick or every second one. All combinations of errors of +-q/2 are tried, q is the step.
 
     The previous force bounds the errors of a tick only if it was reported. Other ticks count with their largest loss.
     """

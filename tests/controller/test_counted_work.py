@@ -1,4 +1,4 @@
-"""Counted work depends on sizes and numbers only, and ends when its budget is spent."""
+"""Counted work depends on the computation, not on the machine's speed, and ends when its budget is spent."""
 
 import os
 import subprocess

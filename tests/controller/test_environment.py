@@ -14,7 +14,7 @@ Z = np.exp(1j * W)
 S = (Z - 1) / (T * Z)
 
 
-def test_figure_4_is_the_closed_form():
+def test_figure_4_equals_its_closed_form():
     """E = Z - Z 1 1' Z / (M s^2 + 1' Z 1), Z = diag(K_i + B_i s)."""
     spring = np.array([800 + S, 700 + S])
     shared = spring[:, None] * spring[None, :] / (S**2 + spring.sum(axis=0))
@@ -40,7 +40,7 @@ def test_static_stiffness_of_figure_4_has_rank_one():
     ],
     ids=["wall", "spring", "held mass", "massless node", "mass on a spring"],
 )
-def test_small_networks_are_their_closed_forms(network, force):
+def test_small_networks_equal_their_closed_forms(network, force):
     np.testing.assert_allclose(environment(network, T).at(Z)[:, 0, 0], force, rtol=1e-7)
 
 
@@ -91,7 +91,7 @@ def oblique_networks(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_oblique_networks_are_their_dynamic_stiffness(seed):
+def test_oblique_networks_equal_their_dynamic_stiffness(seed):
     network = oblique_networks(seed)
     E = environment(network, T)
     M, D, K = network.matrices()

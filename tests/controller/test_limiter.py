@@ -138,7 +138,7 @@ def test_limits_out_of_reach_change_nothing(network):
 
 @pytest.mark.parametrize(("network", "theta"), checkered((FIGURE_4, WALLED), ((0, 0), (1, 2))))
 def test_the_limited_loop_obeys_its_definition(network, theta):
-    """The force f_e is within its limits and the slip e is 0 inside them, or points outwards.
+    """The force f_e is within its limits. The slip e is 0 inside the limits, and at a limit it points outwards.
 
     The linear loop, driven by x - e, sends f_e + rho (e - e_-), where e_- is the slip of the tick before.
     """
@@ -170,7 +170,7 @@ def test_many_simulations_equal_separate_runs():
 @pytest.mark.parametrize("weakest", [np.inf, 2.0], ids=["limiter", "actuators"])
 @pytest.mark.parametrize("channels", [1, 2, 4])
 def test_one_simulation_ticks_like_several(channels, weakest):
-    """Of two simulations the second is also run alone; there each channel reaches both of its limits."""
+    """The second of two simulations is also run alone. In it each channel reaches both of its limits."""
     names, limit = tuple("abcd"[:channels]), np.linspace(2.6, 2.9, channels)
     network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
     coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
@@ -293,7 +293,7 @@ def test_clipped_cycles_give_energy_limited_ones_none():
 
 
 @pytest.mark.parametrize("x", [(0.001, -0.002), (0.03, -0.02), (0.05, 0.05)])
-def test_at_rest_is_where_held_displacements_lead(x):
+def test_at_rest_is_the_state_of_held_displacements(x):
     """The loop keeps the state `at_rest` at held displacements, within the limits and beyond them."""
     limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
     z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 2000, 2)

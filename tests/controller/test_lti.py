@@ -31,14 +31,14 @@ def close(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))
 
 
-def test_response_is_the_definition(blocks):
+def test_responses_equal_their_definition(blocks):
     G = blocks[0]
     expected = [G.C @ np.linalg.solve(z * np.eye(G.order) - G.A, G.B) + G.D for z in Z]
     close(G.at(Z), expected)
 
 
 def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
-    """Eigenvectors and Schur forms of the last matrices A are cached."""
+    """Eigenvectors and Schur forms are cached by A, and must not bring B, C or D of another block along."""
     G, other = blocks
     for H in (G, other, Lti(G.A, 2 * G.B, G.C[::-1], G.D, G.T), Lti(G.A.T, G.C.T, G.B.T, G.D.T, G.T)):
         for z in (Z, 1.5 * Z):  # sums over poles, and substitution
@@ -93,7 +93,7 @@ def test_a_sampled_split_keeps_digits_near_one():
     np.testing.assert_allclose(split.G.real, -400.0, rtol=1e-15)
 
 
-def test_the_quotient_at_one_is_its_definition(blocks):
+def test_the_quotient_at_one_equals_its_definition(blocks):
     G = blocks[0]
     close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
 
@@ -110,13 +110,13 @@ def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
 
 
 @pytest.mark.parametrize("steps", [(0,), (3,), (1, 2), (0, 4, 50)])
-def test_a_delay_line_is_a_power_of_z(steps):
+def test_a_delay_line_equals_a_power_of_z(steps):
     D = delay(steps, 1e-3)
     assert D.order == sum(steps)
     close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
 
 
-def test_output_delays_are_powers_of_z(blocks):
+def test_output_delays_equal_powers_of_z(blocks):
     """The delays are behind a block, before it, in a loop, in branches, and in a ring that no input reaches."""
     G = blocks[0]
     T, loop = G.T, delay((3, 0), G.T) @ G @ delay((1, 4), G.T)

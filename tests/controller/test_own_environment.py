@@ -40,7 +40,7 @@ class Hardening:
         return [Spring((a, b), k), Wall((a, b), 3 * k, gap=self.step), Wall((b, a), 3 * k, gap=self.step)]
 
 
-def test_an_inerter_is_its_dynamic_stiffness():
+def test_an_inerter_equals_its_dynamic_stiffness():
     """In floats E(z) = Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz); over Fractions D is the same."""
     E = environment(INERT, T)
     (M, D, K), c = INERT.matrices(), slice(None, 2)

@@ -34,7 +34,7 @@ def process(F: Lti, limit=np.inf, step=0.0) -> Process:
 def test_three_ticks_by_hand():
     """A spring-damper of 1000 N/m and 2 N s/m is behind a coupling spring of 1000 N/m; theta = 1, the limit is 5 N.
 
-    The force f_e moves its end to u; the end was at u- one tick before:
+    The coupling's force f_e moves the end of the coupling from u-, one tick before, to u:
     f_e = 1000 u + 2 (u - u-)/T = 3000 u - 2000 u-,  u = x - f_e/1000  =>  f_e = (3000 x - 2000 u-) / 4
         k   x[mm]   u-[mm]   f_e[N]     u[mm]     f[N] = f_e one tick later, within 5 N
         0   4       0        3          1         0

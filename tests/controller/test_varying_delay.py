@@ -52,7 +52,7 @@ def test_when_every_packet_is_lost_the_force_stays():
     assert carried(column(*[LOST] * 4), range(1, 5)) == [0, 0, 0, 0]
 
 
-def test_a_constant_delay_is_the_linear_block():
+def test_a_constant_delay_equals_the_linear_block():
     """A delay line behind G equals Theta G with delays (1, 2), up to rounding of sums in another order."""
     E, x = environment(FIGURE_4, T), np.random.default_rng(1).normal(size=(200, 2, 1))
     G, F = (force_map(E, COUPLING, theta, (0, 0)) for theta in ((0, 0), (1, 2)))
@@ -91,7 +91,7 @@ def test_every_allowed_age_sequence_has_delays():
         realising(np.array([[1], [3]]))
 
 
-def test_patterns_are_what_they_are_called():
+def test_each_pattern_draws_the_delays_it_names():
     rng, ticks = np.random.default_rng(4), 40_000
     assert (VaryingDelay((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
     counts = np.bincount(VaryingDelay((1,), (3,)).draw(rng, ticks).ravel())
@@ -99,7 +99,7 @@ def test_patterns_are_what_they_are_called():
     np.testing.assert_allclose(counts[1:], ticks / 3, rtol=0, atol=4 * np.sqrt(ticks * 2 / 9))
     bursty = VaryingDelay((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
     starts = int((np.diff(bursty) == 1).sum())
-    # about 1600 bursts and calm times, both geometric: 4 deviations of their number are 8 percent, of the share 11
+    # 1600 bursts and calm times have geometric lengths. Four deviations are 8 % of their number, 11 % of the share.
     assert starts == pytest.approx(ticks / 25, rel=0.1)
     assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
     recorded = VaryingDelay((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))

@@ -154,7 +154,7 @@ def test_a_touching_wall_is_a_spring_damper(coupling, psi):
     np.testing.assert_allclose(change, expected, rtol=0, atol=1e-9)  # the gaps make forces of up to 11 kN
 
 
-def test_frozen_states_are_the_environments_with_springs():
+def test_frozen_walls_equal_springs_where_they_touch():
     walls = loop_of(BOXED, (1, 2), (0, 0), T).law(SOFT)
     z = np.exp(1j * np.array([0.02, 0.5, 3.0]))
     states = walls.frozen()

@@ -109,7 +109,7 @@ def test_a_guarantee_says_whether_limited_forces_are_covered():
     assert "below" in clipped.guarantee.forces
 
 
-def test_words_say_whether_limited_forces_are_covered():
+def test_reports_say_whether_limited_forces_are_covered():
     scenario = load()
     loop, coupling = scenario.loop("I"), SpringDamper([600.0, 400.0], [0.5, 0.5])
     clipped = assess(loop, coupling, limiter=False, force_limit=(12.0, 12.0))
@@ -125,7 +125,7 @@ def test_words_say_whether_limited_forces_are_covered():
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
 
 
-def test_words_without_limits_name_no_figure():
+def test_reports_name_no_force_if_none_is_declared():
     covered, clipped = on_its_own_loop().force_limits, assess(LOOP, HERE_ONLY, limiter=False).force_limits
     assert covered.words == covered.part()["words"] == "proved, also while forces are limited"
     assert clipped.words.startswith("clipped: a guarantee holds while forces stay below their limits")
@@ -190,7 +190,7 @@ def test_a_guarantee_names_its_limiters_known_devices():
 
 @pytest.mark.slow
 def test_limited_forces_are_not_searched_between_vertices():
-    """The limiter needs 0.9848 times 1.37 N s/m for a mass of 3 kg, and with this multiplier 0.03 % more for 0.2 kg."""
+    """With the multiplier for a mass of 3 kg, the limiter needs 0.9848 times 1.37 N s/m, and 0.03 % more at 0.2 kg."""
     springs = (LOOP.environment.springs[0], change(LOOP.environment.springs[1], stiffness=700.0))
     network = change(LOOP.environment, masses={"mass": 3.0}, springs=springs)
     loop = change(LOOP, environment=network, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.985 * 1.37,))
@@ -203,7 +203,7 @@ def test_limited_forces_are_not_searched_between_vertices():
 
 
 def test_one_environment_covers_no_ranges():
-    """Relative to 1.37 N s/m the nominal mass of 1 kg needs 0.9713, a mass of 0.1 kg 0.9735; 0.973 is available."""
+    """Of 1.37 N s/m the nominal mass of 1 kg needs the share 0.9713 and 0.1 kg needs 0.9735. The device has 0.973."""
     loop = change(LOOP, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.973 * 1.37,))
     nominal = assess(loop, HERE_ONLY, ranges_samples=0, limiter=False)
     assert (nominal.ranges.proved, nominal.holds) == (False, False)

@@ -47,7 +47,7 @@ def judged(name):
 
 
 def transformed(dual, x):
-    """Return D on the upper half of the circle, from a Fourier transform of H and from the matrices C_k."""
+    """Return the dual matrix D on the upper half of the circle, from a Fourier transform of H and the matrices C_k."""
     m, root = dual.loop.channels, np.sqrt(dual.loop.delta)
     w = np.linspace(0, np.pi, POINTS // 2 + 1)
     inner = dual.heights.shape[1]

@@ -117,7 +117,7 @@ def test_every_descent_step_is_feasible_and_better():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # the optimum is compared to 1e-3 only
 def test_the_zeros_are_optimal_for_the_poles(inner):
-    """For the design's poles condition and norm are convex at each frequency: the design is the optimum of cvxpy."""
+    """With the poles fixed, condition and norm are convex at each frequency. The design equals the optimum of cvxpy."""
     import cvxpy as cp  # at the top it would take every worker that collects this file more than a second
 
     loop, design = inner
@@ -153,7 +153,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     ids=["pair", "one"],
 )
 def test_three_steps_beat_the_structured_design(loop, order, diagonal):
-    """The start leaves a share `_START_ROOM` of the damping unused; three steps lower the norm by over ten shares."""
+    """The start leaves a share `_START_ROOM` of the damping unused. Three steps lower the norm by over ten times it."""
     structured, design = spring_damper.design(loop), ccl.design(loop, order, diagonal, most_sdps=3)
     assert design.sdps == structured.sdps + 3  # no step ended in the solver's rounding
     assert design.objective < structured.objective * (1 - 10 * _START_ROOM)

@@ -126,7 +126,7 @@ def test_unsafe_gains_are_refused(coupling, condition):
     assert refusal.value.requirement.ratio > 1
 
 
-def test_no_coupling_is_proved_where_the_damping_suffices():
+def test_loops_without_coupling_are_proved_with_enough_damping():
     """Without a coupling the loop needs 1.7229 N s/m."""
     assert verify(certified(change(DEFAULT, delta=(1.7232, 1.7232)), NoCoupling(), "this-environment")).proved
 

@@ -196,7 +196,7 @@ def mismatch_at(z, E, coupling, lam):
 
 
 @pytest.mark.parametrize("case", ["I", "II"])
-def test_index_25_of_the_default_environment_is_infinite(case):
+def test_tau_of_the_default_environment_is_infinite(case):
     """The least singular value of E falls as the square of the frequency, but the mismatch stays above 50 N/m."""
     z = np.exp(2j * np.pi * np.array([1e-1, 1e-2, 1e-3]) * T)
     E = figure_4_at(z)

@@ -58,7 +58,7 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_damping_within_bounds(k, damping, theta, latency, most):
-    """The requirement is at least 4 % below `most`, which holds for m = 0 and separate bounds on parts of a period.
+    """The requirement is at least 4 % below `most`, for which m = 0 and the parts of a period are bounded separately.
 
     A wall that never loses contact needs no more.
     """
@@ -70,7 +70,7 @@ def test_latency_and_walls_need_damping_within_bounds(k, damping, theta, latency
 
 @pytest.mark.parametrize(("theta", "known", "alone"), [(1, 1.2623, 1.2452), (0, 0.99051, 0.99051)])
 def test_limiter_and_walls_need_damping_within_bounds(theta, known, alone):
-    """The requirement is between that without limiter, `alone`, and `known`, computed for the walls' multiplier m = 0.
+    """The requirement lies between `alone`, without limiter, and `known`, for the walls' multiplier m = 0.
 
     rho is 0.01/T times the requirement without limiter.
     """
@@ -94,7 +94,7 @@ def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
     assert known * (1 - 5e-4) < required < known * (1 + 5e-5)
 
 
-EVERY = {  # fields of a loop by the fact that they add; `walls` and `rho` are read by `combined`
+EVERY = {  # fact -> fields that add it to a loop; `combined` reads `walls` and `rho`
     "latency": {"latency": ((0.1e-3, 0.3e-3),)},
     "walls": {"walls": (wall(3000.0, 2.0),)},
     "limiter": {"rho": 13.0},
@@ -145,8 +145,8 @@ def test_every_combination_is_proved_stored_and_verified(names):
     assert not required_damping(change(loop, delta=(0.999 * least,)), COUPLING, condition).certified
 
 
-def test_limited_walls_need_what_the_block_needs():
-    """With the multipliers of the search `block_by_hand` is positive at 1.001 of the requirement, not at 0.999."""
+def test_limited_walls_agree_with_a_block_by_hand():
+    """With the multipliers of the search, `block_by_hand` is positive at 1.001 of the requirement, but not at 0.999."""
     loop, rho = combined(("walls", "limiter"))
     needs = required_damping(loop, COUPLING, LimitedForces(held=(rho,)))
     binding = max(2 * np.pi * loop.T * needs.frequency_hz, 1e-3)
@@ -165,10 +165,10 @@ HANDS, TICKS = 60, 12000
 
 
 def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
-    """Return how many lossless hands gain 2 % of energy from the middle to the end, or exceed 1 J if one reaches 1e6 J.
+    """Return how many lossless hands gain 2 % of energy from the middle to the end.
 
-    Each tick tries the forces of all ages at both ends of the latency and of the periods T to T_max. Each hand gets
-    the force that gives it most energy.
+    Each tick tries the forces of all ages at both ends of the latency and of the periods T to T_max, and each hand gets
+    the force that gives it most energy. If a hand reaches 1e6 J, the run ends, and hands above 1 J count.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)

@@ -188,7 +188,7 @@ def test_the_exact_inverse_is_an_inverse():
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 3), (1, 0))])
-def test_the_exact_force_map_is_what_runs(coupling, theta, psi):
+def test_the_exact_force_map_equals_the_running_one(coupling, theta, psi):
     F = force_map(environment(FIGURE_4, rational(T)), coupling, theta, psi)
     running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
     rng = np.random.default_rng(4)
@@ -208,7 +208,7 @@ def test_the_static_stiffness_is_exactly_symmetric_and_semidefinite():
     assert "order 2 is zero" in str(definiteness(Matrix.of(F1)))
 
 
-def test_exact_delays_and_sums_are_what_runs():
+def test_exact_delays_and_sums_equal_the_running_ones():
     z = 1.1 * np.exp(0.4j)
     window = [sum(z**-k for k in range(n + 1)) for n in (0, 3)]
     np.testing.assert_allclose(at(moving_sum((0, 3), rational(T)), z), np.diag(window), rtol=1e-12)
@@ -259,7 +259,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
 
 
 def test_the_kyp_form_is_supply_less_storage_increase():
-    """The form of the KYP matrix, x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), is supply less storage increase."""
+    """The KYP form x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du) is the supply less the increase of storage."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
     P = numbers(half + half.T, Fraction(1)) / 7
@@ -293,7 +293,7 @@ def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
     assert fullest > 0.01
 
 
-def test_the_exact_test_refuses_alone(monkeypatch):
+def test_exact_arithmetic_alone_refuses_wrong_storage_matrices(monkeypatch):
     """Without the quick refusal in floating point, a P just outside either end of the valid interval is refused."""
     monkeypatch.setattr(exact, "_refuted_in_floating_point", lambda G, P: False)
     # A P is valid if (3/4 P)(2 - P) > (1/2 - P/2)^2.

@@ -198,7 +198,7 @@ def test_limited_vectors_in_c_repeat_their_test_vector(space, tmp_path, psi, sin
 
 
 @pytest.mark.slow
-def test_force_limits_are_of_vectors_or_axes(space, tmp_path, capsys):
+def test_force_limits_apply_to_vectors_or_axes(space, tmp_path, capsys):
     for values, words in (("2", "2, 2 N"), ("2,1", "2, 1 N"), ("2,2,1,1", "2, 2, 1, 1 N")):
         options = [str(space[1]), "--process", "--force-limit", values, "--out", str(tmp_path / "x.c"), "--json", "-"]
         assert main(options) == 0

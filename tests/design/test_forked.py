@@ -37,13 +37,13 @@ def end_second(first):
     return "computed"
 
 
-def test_another_process_computes():
+def test_a_second_process_computes_at_the_same_time():
     there, sent = Forked(place).result()
     assert there != os.getpid()
     assert sent == bytes(10**6)
 
 
-def test_without_permission_this_process_computes(monkeypatch):
+def test_without_permission_no_second_process_computes(monkeypatch):
     monkeypatch.setattr(forked, "allowed", False)
     assert Forked(place).result()[0] == os.getpid()
 
@@ -52,7 +52,7 @@ def test_this_process_computes_what_a_killed_one_lost():
     assert Forked(end_second, os.getpid()).result() == "computed"
 
 
-def test_errors_are_raised_here():
+def test_errors_of_the_second_process_are_raised():
     with pytest.raises(ZeroDivisionError):
         Forked(divmod, 1, 0).result()
 

@@ -131,7 +131,7 @@ def test_damped_walls_need_the_known_damping(K, B, theta, T, present, required):
     assert best.share == pytest.approx(required, rel=3e-3 if required < 0.001 else 1e-4)
 
 
-def test_a_bare_spring_gains_nothing():
+def test_known_devices_need_equal_damping_for_bare_springs():
     """The motor alone oscillates on a spring without damper as soon as delta < K T/2, so no beta suffices below it."""
     best = sweep_of(wall(1000.0, 0.0, 0, 1e-3), one(1e-3, 1.0)).best(0.4999)
     assert best.share == np.inf
@@ -438,7 +438,7 @@ ATTACKED = [
 
 
 @pytest.mark.parametrize(("K", "B", "theta", "T"), ATTACKED)
-def test_no_lossless_hand_grows_above_the_requirement(K, B, theta, T):
+def test_no_lossless_hand_is_unstable_above_the_requirement(K, B, theta, T):
     loop, F = one(T, 1.0, theta), wall(K, B, theta, T)
     present = this_environment(F, loop.delta).ratio
     needed = min(present, required(F, loop, present))
@@ -452,7 +452,7 @@ def test_no_lossless_hand_grows_above_the_requirement(K, B, theta, T):
         *(pytest.param(*a, marks=pytest.mark.validate) for a in ((500.0, 0.3, 2, 1.2e-3), (800.0, 0.0, 1, 1e-3))),
     ],
 )
-def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
+def test_some_lossless_hand_is_unstable_below_theorem_a(K, B, theta, T):
     loop, F = one(T, 1.0, theta), wall(K, B, theta, T)
     assert worst_hand(F, loop, 0.995 * _necessary_share(F, loop).share, np.random.default_rng(2)) > 1
 
@@ -751,7 +751,7 @@ def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
 
 
 @pytest.mark.slow
-def test_no_coupling_is_optimal_where_it_is_certified():
+def test_loops_certified_without_coupling_are_given_none():
     optimum = design_coupling(KNOWN, "optimal")
     assert isinstance(optimum.coupling, NoCoupling)
     assert optimum.objective == 0
@@ -871,8 +871,8 @@ def test_any_environment_requirements_are_those_of_chi(K, B, theta):
 
 
 @pytest.mark.parametrize("theta", [0, pytest.param(1, marks=pytest.mark.validate)])
-def test_no_lossless_hand_and_environment_grow_together(theta):
-    """With a lossless environment no lossless hand grows at 1.01 of the required damping; far below it some grow."""
+def test_lossless_hands_and_environments_are_stable_together(theta):
+    """With lossless hand and environment no motion grows at 1.01 of the required damping; far below it some do."""
     T, rng = 1e-3, np.random.default_rng(theta)
     loop = one(T, 1.0, theta)
     gains = ((2500.0, 4.0), (1200.0, 1.5))[theta]
@@ -891,7 +891,7 @@ def test_no_lossless_hand_and_environment_grow_together(theta):
 
 
 @pytest.mark.slow
-def test_no_lossless_hand_grows_under_varying_periods():
+def test_no_lossless_hand_is_unstable_under_varying_periods():
     """For 200 hands no product of steps with random periods in [T_min, T_max] grows at 1.01 of the requirement."""
     K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
     loop, F = one(T, 1.0, theta, T_max=high, T_min=low), wall(K, B, theta, T)
@@ -993,7 +993,7 @@ def test_unequal_bounds_need_what_a_dense_sweep_needs():
 
 
 def test_every_device_within_the_bounds_is_covered():
-    """No lossless hand grows with heavier motors, softer transmissions of any permitted damping, and more damping."""
+    """No motion grows with heavier motors, softer transmissions of any permitted damping, and more damping."""
     T, rng = 1e-3, np.random.default_rng(11)
     F, needed = wall(800.0, 0.6, 1, T), bounded_needs()
     for _ in range(20):
@@ -1057,7 +1057,7 @@ def at_its_multipliers(loop, needs, contact_of, walls=(), rho=None):
     return least
 
 
-def test_wall_requirements_are_those_of_the_block():
+def test_wall_requirements_agree_with_a_block_by_hand():
     loop, needs = on_a_wall(3000.0, 2.0, 0), wall_requirement(3000.0, 2.0, 0)
     enough, short = at_its_multipliers(loop, needs, lambda z: contact_by_hand(z, loop.T), (3000.0, 2.0))
     assert enough > 0 > short
@@ -1110,14 +1110,14 @@ def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, *
 
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
-def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, plain):
+def test_no_hand_behind_transmissions_gains_energy_on_walls(k, damping, theta, known, plain):
     loop = on_a_wall(k, damping, theta)
     assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta), ticks=2000) == 0
 
 
 @pytest.mark.slow
 def test_hands_that_never_leave_walls_need_less_damping():
-    """Permanent contact is with a spring-damper, which needs less; at 0.9 of this need some lossless hand grows."""
+    """Permanent contact with a spring-damper needs less; at 0.9 of this need some lossless hand's motion grows."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
     left = left_over(loop, NoCoupling(), required_damping(loop, NoCoupling(), "known-device"))
     assert left.attained
@@ -1131,7 +1131,7 @@ def test_hands_that_never_leave_walls_need_less_damping():
     assert left_over(pair, NoCoupling()) is None
 
 
-def test_hands_grow_on_walls_far_below_the_requirement():
+def test_hands_gain_energy_far_below_the_walls_requirement():
     assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3, ticks=2000) > 0
 
 
@@ -1174,7 +1174,7 @@ LINEAR_OR_WALL = pytest.mark.parametrize("name", ["linear", pytest.param("wall",
 
 
 @LINEAR_OR_WALL
-def test_limited_requirements_are_those_of_the_block(name):
+def test_limited_requirements_agree_with_a_block_by_hand(name):
     loop, needs = LIMITED_LOOPS[name], limited_requirement(name)
     walls = (3000.0, 2.0) if name == "wall" else ()
     enough, short = at_its_multipliers(

@@ -203,7 +203,7 @@ def stored() -> Stored:
     return Stored.of(PAIR, BUILT, prove_limiter(PAIR, BUILT))
 
 
-def test_the_exact_proof_survives_the_file(stored, tmp_path):
+def test_a_stored_limiter_proof_is_verified_after_loading(stored, tmp_path):
     save(stored, tmp_path / "limited.json")
     read = load(tmp_path / "limited.json")
     assert read == stored

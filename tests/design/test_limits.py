@@ -22,7 +22,7 @@ def optimum(damping, bases):
 
 
 @pytest.mark.slow
-def test_more_damping_is_never_worse():
+def test_more_damping_never_worsens_the_optimum():
     """The feasible set grows with the damping."""
     optima = [optimum(damping, 1) for damping in (1.3, 1.37)]
     rms = [transparency_of(*each).rms_mismatch_db for each in optima]

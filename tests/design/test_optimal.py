@@ -533,7 +533,7 @@ def test_invalid_options_and_walls_are_refused():
 
 
 @pytest.mark.parametrize("n", [1, 5, 60])
-def test_matrix_routines_are_those_of_scipy(n):
+def test_matrix_routines_equal_those_of_scipy(n):
     """The routines and SciPy's give the same bits in every storage order: tests compare couplings byte by byte."""
     rng = np.random.default_rng(n)
     rows = rng.standard_normal((3 * n, n))
@@ -598,7 +598,7 @@ def test_a_bound_on_one_unknown_adds_one_derivative():
 
 
 @pytest.mark.parametrize("start", [0.5, 1e-6, 1 - 1e-9])
-def test_the_central_path_is_the_closed_form(start):
+def test_the_central_path_equals_its_closed_form(start):
     """The minimiser of t x - log x - log(1 - x) is the lesser root of t x^2 - (t + 2) x + 1, also from a far start."""
     slope = np.array([1, -1], dtype=complex).reshape(2, 1, 1, 1)
     block = MatrixInequality.of(np.array([0, 1], dtype=complex).reshape(2, 1, 1), slope)

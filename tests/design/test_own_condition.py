@@ -78,7 +78,7 @@ def test_a_condition_covers_only_what_it_names(name):
 
 @pytest.mark.parametrize("names", ["not psi", ("wals",), ["psi"], None, ({},)])
 def test_a_condition_covers_only_known_names(names):
-    """A string would cover each of its parts, and a wrong name nothing."""
+    """As `covers`, a string would cover every name that is a part of it, and a wrong name would cover nothing."""
     with pytest.raises(InputError, match=r"^covers of the condition Wrong is .*, expected a tuple of 'psi', 'T_max', "):
         type("Wrong", (Plain,), {"covers": names})
 

@@ -94,7 +94,7 @@ def test_no_certified_gains_do_better(case, draws):
     assert tried > 10
 
 
-def test_a_handful_of_convex_problems_suffices():
+def test_designs_solve_at_most_four_convex_problems():
     """The design solves at most four problems. tests/benchmarks/test_design_cost.py measures the seconds."""
     assert design(pair()).sdps <= 4
 
@@ -152,7 +152,10 @@ def gains_of_least(cost, theta, sigma):
     ],
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
-    """One matrix inequality or, for most_stored = 0, many that may fail by `_MISSED` between them agree with cvxpy."""
+    """The least costs are those of cvxpy, from one matrix inequality or, if most_stored = 0, from many frequencies.
+
+    Between these frequencies the condition may fail by `_MISSED`.
+    """
     loop = pair((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
     certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in ((-1.0, -0.2), (-0.2, -1.0), (-1.0, 1.0)):
@@ -369,7 +372,7 @@ def test_no_limiter_search_follows_a_failed_linear_search() -> None:
 
 @pytest.mark.parametrize("steps", [7, 100])
 @pytest.mark.parametrize("release", [scipy.__version__, "1.15.0"])
-def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
+def test_slsqp_equals_that_of_scipy(monkeypatch, release, steps):
     """`_slsqp` and SciPy minimise Rosenbrock's function in a disc to the same bits, also when 7 steps are too few."""
     disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
     bounds, options = [(-1.5, 0.9)] * 2, {"maxiter": steps, "ftol": 1e-7}

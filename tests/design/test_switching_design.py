@@ -36,7 +36,7 @@ def designed(tmp_path_factory):
 
 
 def growing(loop, hands=HANDS, seconds=SECONDS):
-    """Return how many lossless hands grow under the loop's adversarial switching."""
+    """Return for how many lossless hands the loop's motion grows under adversarial switching."""
     rng = np.random.default_rng(0)
     low, high = np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0])
     links = np.exp(rng.uniform(low, high, size=(hands, loop.scenario.channels, 1, 3)))
@@ -59,8 +59,8 @@ def test_the_designed_gains_are_proved_for_any_switching(designed):
 
 
 @pytest.mark.slow
-def test_no_lossless_human_grows_under_the_worst_switching(designed):
-    """No lossless hand grows under greedy adversarial switching. With 20 % less damping some do."""
+def test_the_worst_switching_excites_no_lossless_hand(designed):
+    """Under greedy adversarial switching no lossless hand's motion grows; with 20 % less damping it can."""
     _, coupling = designed
     scenario = load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial"))
     placed = [scenario.replace(delta=tuple(share * d for d in scenario.delta)) for share in (1.0, 0.8)]
@@ -105,7 +105,7 @@ def test_any_environment_designs_take_varying_delays(tmp_path):
     [((4, 3), -12.8), pytest.param((14, 10), -13.3, marks=pytest.mark.validate)],
 )
 def test_optimal_couplings_for_switching_delays_are_proved(basis, most_db):
-    """The design is proved and a sweep confirms it. With the larger basis no lossless hand grows at the worst ages."""
+    """A sweep confirms the proof of the design. With the larger basis no lossless hand's motion grows at worst ages."""
     constant = load().loop("I")
     optimum = design_with(constant.switching(DelayRange(*RANGE)), bases=(basis,))
     assert optimum.proved
@@ -133,7 +133,7 @@ def one_known_device():
     ],
 )
 def test_optimal_couplings_of_known_devices_take_switching(scenario, basis, most_db):
-    """The guarantee is proved for known motors, and no lossless hand grows under adversarial switching."""
+    """The guarantee is proved for known motors, and no lossless hand's motion grows under adversarial switching."""
     m = scenario.channels
     lo, hi = (tuple(each[:m]) for each in RANGE)
     loop = scenario.loop("I").switching(DelayRange(lo, hi))

@@ -69,7 +69,7 @@ def sent(coupling: SpringDamper):
 # the proof
 
 
-def test_the_proof_survives_the_file(stored, file):
+def test_a_stored_proof_is_verified_after_loading(stored, file):
     read = load(file)
     assert read == stored
     assert verify(read).proved
@@ -247,8 +247,8 @@ def test_switching_over_ranges_is_guaranteed_for_ranges(ranged):
 
 
 @pytest.mark.validate
-def test_random_members_switch_without_growing_hands(ranged):
-    """In a random member with adversarial switching no lossless hand grows. With half of the damping some grow."""
+def test_random_members_are_stable_under_worst_switching(ranged):
+    """In a random member no motion of lossless hands grows under adversarial switching; with less damping it can."""
     rng = np.random.default_rng(1)
     links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(12, 2, 1, 3)))
     links[..., 1] = 0.0

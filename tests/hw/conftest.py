@@ -16,22 +16,22 @@ def scenario():
 
 
 @pytest.fixture(scope="session")
-def rungs(scenario):
+def link_couplings(scenario):
     """Return certified couplings for links of one and two ticks."""
     return certified_couplings(scenario, "I", None, None, 1, spare=1)
 
 
 @pytest.fixture(scope="session")
-def harmless(scenario, rungs):
+def harmless(scenario, link_couplings):
     """Return a rehearsal without a fault, shortly before most faults begin. Tests continue it in a fork."""
-    rehearsal = _prepared(CASES[0], scenario, rungs)
+    rehearsal = _prepared(CASES[0], scenario, link_couplings)
     rehearsal.run_until_armed(LATE)
     return rehearsal
 
 
 @pytest.fixture(scope="session")
-def free_handles(scenario, rungs):
+def free_handles(scenario, link_couplings):
     """Return a rehearsal as `harmless`, but nobody holds the handles."""
-    rehearsal = _prepared(replace(CASES[0], free=True), scenario, rungs)
+    rehearsal = _prepared(replace(CASES[0], free=True), scenario, link_couplings)
     rehearsal.run_until_armed(LATE)
     return rehearsal

@@ -110,9 +110,9 @@ def test_a_disarmed_device_has_no_force():
     _check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
 
 
-def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
+def test_a_session_stops_where_a_disarmed_device_pushes(scenario, link_couplings):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False).run(0.5)
+    Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, arm=False).run(0.5)
     assert session.stage == Stage.DISARMED
     last = session.link.last
     assert last
@@ -121,18 +121,18 @@ def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
     assert cause_of(session.cause) == "force without arming: 30000 -30000"
 
 
-def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
+def test_bad_lines_do_not_accuse_good_devices(scenario, link_couplings):
     faults = tuple(
         map(FaultInjection.parse, ("up:drop=0.05@0", "down:flip=0.05@0", "reorder=0.03@0", "duplicate=0.1@0"))
     )
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults).run_until_armed(1.5)
+    Rehearsal(session, Emulator(scenario, faults), lambda ages: link_couplings, faults).run_until_armed(1.5)
     assert session.stage == Stage.ARMED
     assert session.counters.misses > 50
     assert session.counters.unlike == 0
 
 
-def hand_driven(scenario, rungs, tested=False, behind=()):
+def hand_driven(scenario, link_couplings, tested=False, behind=()):
     """Return a session that has begun to arm, and a function that sends it a STATE; its time is `lie` [us], if any."""
     settings = LinkSettings(measure=50, test_encoders=tested, behind=behind)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
@@ -149,7 +149,7 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
 
     while session.stage == Stage.MEASURING:
         send(Phase.DISARMED)
-    session.load(rungs, t)
+    session.load(link_couplings, t)
     session.take(Refused.ACCEPTED, t)
     send(Phase.DISARMED)
     session.arm(t)
@@ -157,9 +157,9 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
     return session, send
 
 
-def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
+def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, link_couplings):
     """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze a pulse of 0.19 mm is a jump."""
-    session, send = hand_driven(scenario, rungs, tested=True)
+    session, send = hand_driven(scenario, link_couplings, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0
     for k in range(10):
@@ -174,9 +174,9 @@ def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
 
 
 @pytest.mark.parametrize(("lost", "ticks"), [(5, " 2"), (6, " 2"), (7, "")])
-def test_jumps_beside_lost_states_stop_sessions(scenario, rungs, lost, ticks):
+def test_jumps_beside_lost_states_stop_sessions(scenario, link_couplings, lost, ticks):
     """A handle moves at 0.2 m/s, and its encoder jumps by 2 mm in tick 6. The STATE of a tick beside it is lost."""
-    session, send = hand_driven(scenario, rungs, tested=True)
+    session, send = hand_driven(scenario, link_couplings, tested=True)
     session.drive._commands = None  # this device applies no forces
     for k in [k for k in range(9) if k != lost]:
         gap = 1 + (k == lost + 1)
@@ -186,9 +186,9 @@ def test_jumps_beside_lost_states_stop_sessions(scenario, rungs, lost, ticks):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_repeated_samples_of_slower_boards_are_no_jumps(scenario, rungs, axis):
+def test_repeated_samples_of_slower_boards_are_no_jumps(scenario, link_couplings, axis):
     """At 0.6 m/s a repeated sample removes 0.72 mm from one displacement; the board that leads repeats none."""
-    session, send = hand_driven(scenario, rungs, tested=True, behind=(0, 1))
+    session, send = hand_driven(scenario, link_couplings, tested=True, behind=(0, 1))
     for k in range(10):
         place = 720 * (k - (k > 5))
         send(Phase.ARMED, counts=(place, 0) if axis == 0 else (0, place))
@@ -196,8 +196,8 @@ def test_repeated_samples_of_slower_boards_are_no_jumps(scenario, rungs, axis):
     assert axis or cause_of(session.cause).startswith("jolt: 1 0.72 ")
 
 
-def test_leaps_of_the_tick_number_stop_sessions(scenario, rungs):
-    session, send = hand_driven(scenario, rungs)
+def test_leaps_of_the_tick_number_stop_sessions(scenario, link_couplings):
+    session, send = hand_driven(scenario, link_couplings)
     for _ in range(6):
         send(Phase.ARMED)
     assert 0 < session.gain < 0.03
@@ -206,15 +206,15 @@ def test_leaps_of_the_tick_number_stop_sessions(scenario, rungs):
     send(Phase.ARMED, ticks=300, counts=(89_000, 0))
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "tick leap: 300 5")
     assert drive.gain < 0.03
-    session, send = hand_driven(scenario, rungs)
+    session, send = hand_driven(scenario, link_couplings)
     assert session.stage == Stage.ARMING  # a leap before the first force stops the session, too
     send(Phase.ARMED, ticks=300)
     assert session.stage == Stage.STOPPED
 
 
-def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
+def test_a_device_that_stops_telling_margins_is_stopped(scenario, link_couplings):
     """The device obeys and counts no miss, but without margins nobody knows whether answers come in time."""
-    session, send = hand_driven(scenario, rungs)
+    session, send = hand_driven(scenario, link_couplings)
     for _ in range(250):
         send(Phase.ARMED)
     assert session.stage == Stage.ARMED
@@ -227,9 +227,9 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
     assert cause_of(session.cause) == "missing margins: 90 200"
 
 
-def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
+def test_devices_hiding_every_second_state_are_stopped(scenario, link_couplings):
     """Forces are judged from tick to tick, which is impossible where a fifth of the ticks has no STATE."""
-    session, send = hand_driven(scenario, rungs)
+    session, send = hand_driven(scenario, link_couplings)
     for _ in range(250):
         send(Phase.ARMED)
     told = 0
@@ -241,8 +241,8 @@ def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
     assert cause_of(session.cause) == "missing STATEs: 20 200"
 
 
-def test_devices_holding_too_long_are_stopped(scenario, rungs):
-    session, send = hand_driven(scenario, rungs)
+def test_devices_holding_too_long_are_stopped(scenario, link_couplings):
+    session, send = hand_driven(scenario, link_couplings)
     for _ in range(250):
         send(Phase.ARMED)
     for _ in range(session.config.hold):
@@ -252,8 +252,8 @@ def test_devices_holding_too_long_are_stopped(scenario, rungs):
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "long hold: 5 4")
 
 
-def test_emergency_stops_repeat_until_latched(scenario, rungs):
-    session, _ = hand_driven(scenario, rungs)
+def test_emergency_stops_repeat_until_latched(scenario, link_couplings):
+    session, _ = hand_driven(scenario, link_couplings)
     session.estop("space bar", 0)
     told = session.take(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0)), 0)
     assert told == (Stop(Reason.ESTOP),)
@@ -263,7 +263,7 @@ def test_emergency_stops_repeat_until_latched(scenario, rungs):
 @pytest.mark.parametrize("configuring", [False, True])
 @pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
 def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
-    """STOP answers a force without arming, whatever the status. After CONFIG, such a force soon stops the session."""
+    """A device that drives before arming is sent STOP, whatever its status. After CONFIG the session soon ends, too."""
     session, port = Session(scenario, SafetyLimits((12.0, 12.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
@@ -281,12 +281,12 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
         assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives without a command")
 
 
-def test_fake_device_clocks_are_found(scenario, rungs):
+def test_fake_device_clocks_are_found(scenario, link_couplings):
     """The device's clock advances by T per STATE, but STATEs come every 2 T.
 
     After 20 of them the host's clock is ahead by 20 T, which is 10 % of a block.
     """
-    session, send = hand_driven(scenario, rungs)
+    session, send = hand_driven(scenario, link_couplings)
     assert session.link.last
     begun = session.link.last.t_us
     for n in range(1, 60):

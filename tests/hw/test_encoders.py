@@ -26,7 +26,7 @@ T = 1.2e-3
 STEP = 4e-4  # [N] per step of force
 
 
-def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step=None, stop=None, **settings):
+def session_with(scenario, link_couplings, *faults, seconds=1.0, place=None, encoder_step=None, stop=None, **settings):
     """Run a session until `seconds` after arming, and stop it at `stop` [s] if given; return session and rehearsal."""
     if encoder_step:
         devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
@@ -37,7 +37,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
     if place is not None:  # the handles are there when the session begins
         emulator.plant.s[: emulator.plant.scene.model.nq] = place
     actions = [(stop, lambda session, now: session.stop("asked to", now))] if stop else []
-    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, actions=actions)
+    rehearsal = Rehearsal(session, emulator, lambda ages: link_couplings, faults, actions=actions)
     rehearsal.run_until_armed(seconds)
     return session, rehearsal
 
@@ -46,17 +46,19 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
 
 
 @pytest.mark.parametrize(("axis", "kind"), checkered([1, 2], ["freeze", "toggle"]))
-def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
+def test_a_dead_encoder_is_found_at_arming(scenario, link_couplings, kind, axis):
     """The encoder is found before the gain rises, so nobody feels more than the test force."""
-    session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
+    session, rehearsal = session_with(scenario, link_couplings, f"axis{axis}:{kind}")
     assert session.stage == Stage.STOPPED
     assert cause_of(session.cause).startswith(f"dead encoder: {axis} ")
     assert max(np.abs(m.applied).max() for m in rehearsal.moments) <= 1.3
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
-def test_of_two_dead_encoders_the_first_is_named(scenario, rungs):
-    assert cause_of(session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause).startswith("dead encoder: 1 ")
+def test_of_two_dead_encoders_the_first_is_named(scenario, link_couplings):
+    assert cause_of(session_with(scenario, link_couplings, "freeze", "axis2:freeze")[0].cause).startswith(
+        "dead encoder: 1 "
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,26 +71,26 @@ def test_of_two_dead_encoders_the_first_is_named(scenario, rungs):
         *(pytest.param(1e-5, 0.17, held, marks=pytest.mark.validate) for held in (True, False)),
     ],
 )
-def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
+def test_live_encoders_answer_a_faint_force(scenario, link_couplings, step, most, held):
     """A force of at most `most` [N] shows that encoders with counts of `step` [m] work, with and without hands."""
     still = scenario if held else nobody(scenario)
     forces = []
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))
     devices = tuple(replace(d, encoder_step=step) for d in still.device)
     session.record = lambda row: forces.append(row.test or (0.0, 0.0))
-    rehearsal = Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs)
+    rehearsal = Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: link_couplings)
     rehearsal.run_until_armed(0.6 if step < 1e-4 else 1.4)
     assert session.stage == Stage.ARMED
     assert 0 < np.abs(forces).max() <= most
 
 
 @pytest.mark.parametrize("share", [1.1, 1.5])
-def test_small_declared_masses_are_blamed(scenario, rungs, share):
+def test_small_declared_masses_are_blamed(scenario, link_couplings, share):
     """A heavier compliant device swings more slowly than expected, which looks like a hidden delay or a hand."""
     free = nobody(scenario)
     heavy = [replace(d, motor_mass=share * d.motor_mass, handle_mass=share * d.handle_mass) for d in free.device]
     session = Session(free, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=False))
-    Rehearsal(session, Emulator(free.replace(device=tuple(heavy))), lambda ages: rungs).run_until_armed(1.0)
+    Rehearsal(session, Emulator(free.replace(device=tuple(heavy))), lambda ages: link_couplings).run_until_armed(1.0)
     assert session.stage == Stage.STOPPED
     assert "mass is not as declared" in session.cause
 
@@ -343,13 +345,13 @@ def test_a_moving_hand_is_no_motor(hand, closing):
 
 
 @pytest.mark.parametrize(("axis", "scale"), checkered([1, 2], [0.4, 2.5]))
-def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
-    session, _ = session_with(scenario, rungs, f"axis{axis}:scale={scale}")
+def test_wrong_scales_are_found_under_hands(scenario, link_couplings, axis, scale):
+    session, _ = session_with(scenario, link_couplings, f"axis{axis}:scale={scale}")
     assert session.stage == Stage.STOPPED
     assert cause_of(session.cause).startswith(f"wrong scale: {axis} {scale} ")
 
 
-def live(scenario, rungs, hand):
+def live(scenario, link_couplings, hand):
     """Return the rehearsal of a session that a person ends at 0.9 s.
 
     A `hand` (mass, damping, stiffness) takes both handles at 0.7 s.
@@ -365,7 +367,7 @@ def live(scenario, rungs, hand):
 
     actions = [(0.7, swap), (0.9, lambda session, now: session.stop("asked to", now))]
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=False))
-    rehearsal = Rehearsal(session, Emulator(still), lambda ages: rungs, actions=actions)
+    rehearsal = Rehearsal(session, Emulator(still), lambda ages: link_couplings, actions=actions)
     return rehearsal
 
 
@@ -382,26 +384,26 @@ def ended(rehearsal, *faults, lets_go=9.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
-def test_sessions_finish_once_handles_are_let_go(scenario, rungs, hand):
+def test_sessions_finish_once_handles_are_let_go(scenario, link_couplings, hand):
     """A firm hand is asked to let go, not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
-    stage, cause, log = ended(live(scenario, rungs, hand), lets_go=2.5)
+    stage, cause, log = ended(live(scenario, link_couplings, hand), lets_go=2.5)
     assert stage == Stage.FINISHED, cause
     assert hand[0] < 0.3 or any("let go" in request and "axis 1" in request for request in log)
 
 
 @pytest.mark.slow
-def test_sessions_with_held_handles_never_finish(scenario, rungs, monkeypatch):
+def test_sessions_with_held_handles_never_finish(scenario, link_couplings, monkeypatch):
     """A person has 5 s (here 1.5 s) to let go."""
     monkeypatch.setattr("haptic_loop.hw.encoders._LETTING_GO", 1.5)
-    stage, cause, _ = ended(live(scenario, rungs, (0.4, 3.0, 100.0)))
+    stage, cause, _ = ended(live(scenario, link_couplings, (0.4, 3.0, 100.0)))
     assert stage == Stage.STOPPED
     assert cause_of(cause) == "held at the end: 1"
 
 
 @pytest.fixture(scope="module")
-def gripped(scenario, rungs):
+def gripped(scenario, link_couplings):
     """Return a rehearsal in which a firm hand has just taken the handles."""
-    rehearsal = live(scenario, rungs, (0.5, 20.0, 1500.0))
+    rehearsal = live(scenario, link_couplings, (0.5, 20.0, 1500.0))
     rehearsal.run_until_armed(0.75)
     return rehearsal
 
@@ -418,9 +420,9 @@ def test_short_live_sessions_find_what_became_wrong(gripped, fault):
 
 
 @pytest.mark.parametrize("at", [0.05, 0.3])
-def test_sessions_stopped_at_zero_gain_do_not_finish(scenario, rungs, at):
+def test_sessions_stopped_at_zero_gain_do_not_finish(scenario, link_couplings, at):
     """At 0.05 s the encoders are tested and the gain is still 0; at 0.3 s it has risen."""
-    session, _ = session_with(scenario, rungs, stop=at, seconds=1.5)
+    session, _ = session_with(scenario, link_couplings, stop=at, seconds=1.5)
     assert (session.stage == Stage.FINISHED) == (at == 0.3), session.cause
     assert at == 0.3 or "before the motors of the last arming were tested" in session.cause
 
@@ -450,16 +452,16 @@ def test_the_expected_motion_is_the_closed_form():
 
 
 @pytest.mark.parametrize("noise", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
-def test_dead_encoders_with_noise_are_found(scenario, rungs, noise):
+def test_dead_encoders_with_noise_are_found(scenario, link_couplings, noise):
     """Dead encoders with noise are found, before and while forces act.
 
     tests/checks/faults.py arms live encoders with the same noise, and has dead ones with a noise of 0.5 counts.
     """
-    dead, _ = session_with(scenario, rungs, "axis1:freeze", f"axis1:noise={noise}")
+    dead, _ = session_with(scenario, link_couplings, "axis1:freeze", f"axis1:noise={noise}")
     assert dead.stage == Stage.STOPPED
     assert cause_of(dead.cause).startswith("dead encoder: 1 ")
     later, _ = session_with(
-        scenario, rungs, f"axis1:noise={noise}", "axis1:freeze@0.45", f"axis1:noise={noise}@0.45", seconds=2.0
+        scenario, link_couplings, f"axis1:noise={noise}", "axis1:freeze@0.45", f"axis1:noise={noise}@0.45", seconds=2.0
     )
     assert later.stage == Stage.STOPPED
     assert re.match("still (encoder|handle): 1 ", cause_of(later.cause))
@@ -519,30 +521,30 @@ def test_coarse_counts_hide_a_calm_tremor(count, dead):
 
 
 @pytest.mark.parametrize("cap", [pytest.param(0.3, marks=pytest.mark.slow), 0.4])
-def test_sessions_of_coarse_free_handles_finish(scenario, rungs, cap):
+def test_sessions_of_coarse_free_handles_finish(scenario, link_couplings, cap):
     """After its test an axis shows no motion in counts of 0.1 mm, although the force has changed by the cap."""
     free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
     session = Session(free, SafetyLimits((cap, cap)), LinkSettings(measure=60, held=False))
     stop = (1.4, lambda session, now: session.stop("asked to", now))
-    Rehearsal(session, Emulator(free), lambda ages: rungs, actions=[stop]).run_until_armed(4.0)
+    Rehearsal(session, Emulator(free), lambda ages: link_couplings, actions=[stop]).run_until_armed(4.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "asked to")
 
 
 @pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
-def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
+def test_a_dead_encoder_is_found_while_forces_act(scenario, link_couplings, kind, axis, sign):
     """In whichever direction people begin, the dead encoder is named within 0.7 s of the log's previous entry."""
     turned = tuple(
         replace(h, voluntary=replace(h.voluntary, phase=h.voluntary.phase + np.pi * (sign < 0))) for h in scenario.human
     )
-    session, _ = session_with(scenario.replace(human=turned), rungs, f"axis{axis}:{kind}@0.45", seconds=1.2)
+    session, _ = session_with(scenario.replace(human=turned), link_couplings, f"axis{axis}:{kind}@0.45", seconds=1.2)
     assert session.stage == Stage.STOPPED
     assert cause_of(session.cause).startswith(f"still encoder: {axis} ")
     assert 1e-6 * (session.log[-1].t_us - session.log[-2].t_us) < 0.7
 
 
 @pytest.mark.parametrize(("axis", "most"), checkered([1, 2], [4.0, -4.0]))
-def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
-    session, _ = session_with(scenario, rungs, f"axis{axis}:saturate={most}@0.3", seconds=2.0)
+def test_a_saturated_encoder_is_found(scenario, link_couplings, axis, most):
+    session, _ = session_with(scenario, link_couplings, f"axis{axis}:saturate={most}@0.3", seconds=2.0)
     assert session.stage == Stage.STOPPED
     assert re.match(f"(still encoder|jump|jolt): {axis} ", cause_of(session.cause))
 
@@ -599,7 +601,7 @@ def test_coarse_encoders_get_more_time():
 
 @pytest.mark.parametrize(("friction", "stops"), [(0.45, False), (0.7, True)])
 def test_friction_hides_twice_its_force(friction, stops):
-    """A hand of 500 N/m holds a handle with dry friction F, which rests while a slow force turns round by 2 F."""
+    """A hand of 500 N/m holds a handle with dry friction F. It rests until the force has turned round by 2 F."""
     monitor, x = monitor_of(1e-5), 0.0
     with stopped_by("still encoder: 1 ") if stops else nullcontext():
         for k in range(round(5.0 / T)):
@@ -622,7 +624,7 @@ def test_no_session_stops_for_a_still_hold():
 
 
 @pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
+def test_a_knock_on_a_handle_is_no_jump(scenario, link_couplings, axis):
     """A knock of 0.14 N s moves 0.25 kg at 0.56 m/s, and the motor swings by 1 mm at 90 Hz against the handle."""
     free = nobody(scenario)
     session = Session(free, SafetyLimits((1.3, 1.3)), LinkSettings(measure=60, held=False))
@@ -632,7 +634,7 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
         emulator.plant.s[6 + axis] += 0.14 / 0.19  # the state has four positions, two motors' and two handles' speeds
         return ()
 
-    Rehearsal(session, emulator, lambda ages: rungs, actions=[(0.7, knock)]).run_until_armed(0.9)
+    Rehearsal(session, emulator, lambda ages: link_couplings, actions=[(0.7, knock)]).run_until_armed(0.9)
     assert session.stage == Stage.ARMED, session.cause
     assert emulator.plant.fastest > 1.0  # [m/s] mean speed and swing of the motor
 
@@ -641,21 +643,21 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
 
 
 @pytest.mark.parametrize("place", [0.03, pytest.param(-0.03, marks=pytest.mark.slow)])
-def test_handles_off_centre_feel_little_force(scenario, rungs, place):
+def test_handles_off_centre_feel_little_force(scenario, link_couplings, place):
     """Free handles at 30 mm feel below 0.5 N if positions count from there, and over 3 N if from the middle."""
     still = nobody(scenario)
-    session, rehearsal = session_with(still, rungs, place=place, seconds=0.6, held=False)
+    session, rehearsal = session_with(still, link_couplings, place=place, seconds=0.6, held=False)
     assert session.stage == Stage.ARMED
     assert max(np.abs(m.applied).max() for m in rehearsal.moments) < 0.5
     told = [event.cause for event in session.log if event.cause.startswith("positions count from")]
     assert told == [f"positions count from where the handles are: {1e3 * place:+.4g}, {1e3 * place:+.4g} mm"]
-    away, rehearsal = session_with(still, rungs, place=place, seconds=0.6, rereference=False, held=False)
+    away, rehearsal = session_with(still, link_couplings, place=place, seconds=0.6, rereference=False, held=False)
     assert max(np.abs(m.applied).max() for m in rehearsal.moments) > 3
     assert not any("positions count" in event.cause for event in away.log)
 
 
-def test_the_range_counts_from_the_middle(scenario, rungs):
-    session, _ = session_with(nobody(scenario), rungs, "axis2:jump=99.5", "axis1:jump=-101", seconds=0.2)
+def test_the_range_counts_from_the_middle(scenario, link_couplings):
+    session, _ = session_with(nobody(scenario), link_couplings, "axis2:jump=99.5", "axis1:jump=-101", seconds=0.2)
     assert cause_of(session.cause).startswith("range: 1 -101 ")
 
 

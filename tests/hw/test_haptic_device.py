@@ -346,7 +346,7 @@ def test_a_missing_library_gives_one_line(monkeypatch):
 
 
 @pytest.mark.parametrize("written", ["", "Could not find libdrd. Is it installed?\n"])
-def test_the_package_without_the_makers_sdk_says_so(monkeypatch, capsys, written):
+def test_the_package_without_the_makers_library_is_explained(monkeypatch, capsys, written):
     """The package is installed, writes a line and raises, as it does without libdrd."""
 
     class Finder:

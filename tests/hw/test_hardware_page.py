@@ -31,13 +31,15 @@ IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # rows th
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_the_pages_fault_table_equals_rehearsals(row, scenario, rungs, harmless):
+def test_the_pages_fault_table_equals_rehearsals(row, scenario, link_couplings, harmless):
     fault, ends, cause, zero = row
     shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
     names = CALLED.get(fault, (fault,))
     cases = [next(case for case in CASES if case.name == name) for name in names]
     outcomes = [
-        in_fork(rehearse_late_case, case, harmless) if begins_late(case) else _rehearse_case(case, scenario, rungs)[1]
+        in_fork(rehearse_late_case, case, harmless)
+        if begins_late(case)
+        else _rehearse_case(case, scenario, link_couplings)[1]
         for case in cases
     ]
     times = [f"{outcome.zero_force_ms:.1f}" for outcome in outcomes]

@@ -201,7 +201,7 @@ def test_115200_baud_is_refused_with_the_arithmetic():
     ]
 
 
-def test_a_fitting_device_meets_no_objection():
+def test_a_device_that_fits_meets_no_objection():
     assert SafetyLimits((12.0, 12.0)).objections(INFO, load(), 921_600) == []
 
 
@@ -221,7 +221,7 @@ def test_the_configuration_never_exceeds_the_protocol(period_ns):
     assert (config.hold + config.ramp) * period_ns <= MAX_RELEASE_NS
 
 
-def test_the_wire_carries_what_the_motor_does():
+def test_devices_receive_the_negative_force_in_steps():
     """The device gets -f, in whole steps, and never more than the cap."""
     units = Units.of(INFO)
     assert units.steps((1.0, -2.0), (30000, 30000)) == (-2500, 5000)

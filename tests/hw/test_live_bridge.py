@@ -240,14 +240,14 @@ def test_a_missing_port_leaves_no_files(port, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "name", ["SIGINT", *(pytest.param(f"SIG{n}", marks=pytest.mark.slow) for n in ("TERM", "QUIT"))]
 )
-def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
+def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, link_couplings, name):
     def watch(session):
         if session.stage == Stage.MEASURING and not sent:
             sent.append(name)
             signal.raise_signal(getattr(signal, name))
 
     sent = []
-    session, live = run(emulator, scenario, lambda ages: rungs, watch=watch)
+    session, live = run(emulator, scenario, lambda ages: link_couplings, watch=watch)
     assert (session.stage, session.cause) == (Stage.STOPPED, f"{name}, before any force acted")
     assert live.signals == [getattr(signal, name)]
 
@@ -348,7 +348,7 @@ class Designing:
 
     stage, measurement = Stage.MEASURED, SimpleNamespace(result=None)
 
-    def load(self, rungs, now):
+    def load(self, link_couplings, now):
         self.stage = Stage.DISARMED if self.stage == Stage.MEASURED else self.stage
         return ()
 
@@ -416,9 +416,9 @@ def test_a_refusal_is_the_first_line(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_pulled_cable_ends_the_session(scenario, rungs):
+def test_a_pulled_cable_ends_the_session(scenario, link_couplings):
     emulator = EmulatorProcess("--fault=unplug@0.05", f"--pace={PACE}")
-    session, _ = run(emulator, scenario, lambda ages: rungs)
+    session, _ = run(emulator, scenario, lambda ages: link_couplings)
     assert session.stage in (Stage.LOST, Stage.STOPPED)
     assert session.cause
     assert emulator.end(patience=120.0)["phase"] in AT_REST

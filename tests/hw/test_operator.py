@@ -14,10 +14,10 @@ from tests.causes import cause_of
 from tests.sessions import MovesAxes
 
 
-def rehearsal_of(scenario, rungs, operator, *faults):
+def rehearsal_of(scenario, link_couplings, operator, *faults):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100))
     faults = tuple(map(FaultInjection.parse, faults))
-    return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=operator)
+    return Rehearsal(session, Emulator(scenario, faults), lambda ages: link_couplings, faults, operator=operator)
 
 
 def stages(session):
@@ -26,21 +26,21 @@ def stages(session):
 
 
 @pytest.mark.parametrize("start", [0.2496, 0.5])
-def test_a_session_arms_by_itself_once(scenario, rungs, start):
+def test_a_session_arms_by_itself_once(scenario, link_couplings, start):
     """Late answers, in ramp-in or after it, end a session if nobody arms the softer coupling."""
-    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
+    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
     session = rehearsal.run_until_armed(2.0)
     assert session.stage == Stage.REFUSED
     assert cause_of(session.cause).startswith("nobody to arm:")
     assert stages(session).count(Stage.ARMING) == 1
 
 
-def test_a_key_during_a_hindrance_arms_nothing(scenario, rungs, monkeypatch):
+def test_a_key_during_a_hindrance_arms_nothing(scenario, link_couplings, monkeypatch):
     """A key that could not arm the session does not count as an arming: the session arms by itself later."""
     held = [False]
     monkeypatch.setattr(Session, "held", property(lambda session: held[0]))
     operator = Operator(True, 5.0)
-    rehearsal = rehearsal_of(scenario, rungs, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator)
     session = rehearsal.run(0.3)
     operator.press("a", session, session.now)
     assert session.stage == Stage.DISARMED
@@ -48,18 +48,18 @@ def test_a_key_during_a_hindrance_arms_nothing(scenario, rungs, monkeypatch):
     assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
 
 
-def test_sessions_with_late_answers_never_reach_full_gain(scenario, rungs):
+def test_sessions_with_late_answers_never_reach_full_gain(scenario, link_couplings):
     """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
-    session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
+    session = rehearsal_of(scenario, link_couplings, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
     assert Stage.DISARMING in stages(session)
     assert Stage.ARMED not in stages(session)
     assert session.stage == Stage.REFUSED
     assert stages(session).count(Stage.ARMING) == 1
 
 
-def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
+def test_sessions_end_after_their_time_at_full_gain(scenario, link_couplings):
     operator = Operator(True, 0.3)
-    rehearsal = rehearsal_of(scenario, rungs, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator)
     session = rehearsal.run_until_armed(0.6)
     assert session.stage == Stage.ARMED
     assert operator.press("a", session, session.now) == ()
@@ -69,10 +69,10 @@ def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
     assert at[Stage.DISARMING] - at[Stage.ARMED] == pytest.approx(300_000, abs=2400)  # the time is checked once a tick
 
 
-def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
+def test_a_key_arms_a_disarmed_session_only(scenario, link_couplings):
     """A key pressed in a ramp-out must not arm the next coupling."""
     operator = Operator(False, 5.0)
-    rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.5")
+    rehearsal = rehearsal_of(scenario, link_couplings, operator, "down:jitter=0.0008@0.5")
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == ()
@@ -89,8 +89,8 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     assert stages(session).count(Stage.ARMING) == 2
 
 
-def test_other_keys_do_nothing(scenario, rungs):
-    rehearsal = rehearsal_of(scenario, rungs, Operator(False, 1.0))
+def test_other_keys_do_nothing(scenario, link_couplings):
+    rehearsal = rehearsal_of(scenario, link_couplings, Operator(False, 1.0))
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     for key in ("x", "\n", "A"):
@@ -99,10 +99,10 @@ def test_other_keys_do_nothing(scenario, rungs):
 
 
 @pytest.mark.parametrize("encoders", [True, False])
-def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
+def test_sessions_that_never_armed_have_not_finished(scenario, link_couplings, encoders):
     settings = LinkSettings(measure=100, test_encoders=encoders)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
-    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, arm=False)
     assert rehearsal.run(0.3).stage == Stage.DISARMED
     Operator(False, 5.0).press("q", session, session.now)
     assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")
@@ -111,33 +111,35 @@ def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
 # axes that a person moves before the first arming
 
 
-def shown(scenario, rungs, monkeypatch, *faults, mm=6.0, seconds=8.0):
+def shown(scenario, link_couplings, monkeypatch, *faults, mm=6.0, seconds=8.0):
     """Run a session whose person moves each axis by `mm` when asked, and repeats a wrong motion from the same place."""
     monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 300_000)
     free, faults = nobody(scenario), tuple(map(FaultInjection.parse, faults))
     session = Session(free, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100, held=False, check_axes=True))
     emulator = Emulator(free, faults)
     person = MovesAxes(emulator, mm)
-    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, operator=Operator(True, 5.0), watch=person)
+    rehearsal = Rehearsal(
+        session, emulator, lambda ages: link_couplings, faults, operator=Operator(True, 5.0), watch=person
+    )
     rehearsal.run_until_armed(0.6) if seconds is None else rehearsal.run_to_the_end(seconds)
     return session, rehearsal, person.axes
 
 
-def test_axes_moved_as_asked_arm(scenario, rungs, monkeypatch):
-    session, rehearsal, axes = shown(scenario, rungs, monkeypatch, seconds=None)
+def test_axes_moved_as_asked_arm(scenario, link_couplings, monkeypatch):
+    session, rehearsal, axes = shown(scenario, link_couplings, monkeypatch, seconds=None)
     assert session.stage == Stage.ARMED, session.cause
     assert axes == [1, 2]
     assert rehearsal.armed_us > 1e6 * (0.1 + 2 * 0.5 + 0.3)  # the measurement, two rests, the time to let go
 
 
-def test_no_force_shows_exchanged_axes(scenario, rungs):
+def test_no_force_shows_exchanged_axes(scenario, link_couplings):
     """Without the person the motor test passes, because motors and encoders are exchanged and reversed together."""
-    rehearsal = rehearsal_of(scenario, rungs, None, "exchange", "motor=-1", "reverse")
+    rehearsal = rehearsal_of(scenario, link_couplings, None, "exchange", "motor=-1", "reverse")
     assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
 
 
-def test_small_motions_show_no_axis(scenario, rungs, monkeypatch):
-    session, _, axes = shown(scenario, rungs, monkeypatch, mm=4.9, seconds=1.7)
+def test_small_motions_show_no_axis(scenario, link_couplings, monkeypatch):
+    session, _, axes = shown(scenario, link_couplings, monkeypatch, mm=4.9, seconds=1.7)
     assert (session.stage, axes) == (Stage.DISARMED, [1])
     session.arm(session.now)
     assert session.stage == Stage.DISARMED

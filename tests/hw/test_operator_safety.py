@@ -38,16 +38,16 @@ from haptic_loop.sim.scenario import InputError, load
 ROOT = Path(__file__).parent.parent.parent
 
 
-def rehearsal_of(scenario, rungs, operator):
+def rehearsal_of(scenario, link_couplings, operator):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    return Rehearsal(session, Emulator(scenario), lambda ages: rungs, operator=operator)
+    return Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, operator=operator)
 
 
 # the deadman
 
 
 @pytest.mark.parametrize("until", [0.0, 0.4, pytest.param(0.9, marks=pytest.mark.slow)])
-def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
+def test_releasing_the_deadman_ramps_out(scenario, link_couplings, until):
     """The session ramps out in 100 ms, one second after the last sign of a person."""
     shown = []
 
@@ -58,7 +58,7 @@ def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
             return True
         return since is None
 
-    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 10.0, there))
+    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 10.0, there))
     session = rehearsal.run_until_armed(3.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "deadman: 1")
     at = {event.stage: event.t_us for event in session.log}
@@ -68,15 +68,15 @@ def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
 
 
 @pytest.mark.slow
-def test_holding_the_deadman_continues_the_session(scenario, rungs):
-    session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
+def test_holding_the_deadman_continues_the_session(scenario, link_couplings):
+    session = rehearsal_of(scenario, link_couplings, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
 
 
-def test_a_release_ends_the_last_motor_test(scenario, rungs):
+def test_a_release_ends_the_last_motor_test(scenario, link_couplings):
     """A person gives no sign after full gain. 1 s later, during the last motor test, the session stops."""
     rehearsal = rehearsal_of(
-        scenario, rungs, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
+        scenario, link_couplings, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
     )
     session = rehearsal.session
     rehearsal.run_until_armed(4.0)
@@ -94,11 +94,13 @@ def test_fast_free_handles_are_announced():
     assert "--force-cap 34.2" in bridge._fast_handle(wheel, [0.2 * 35, 0.2 * 30])
 
 
-def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
+def test_the_devices_deadman_allows_and_ends_forces(scenario, link_couplings):
     """The session arms only while the switch is held, and ramps out at the first STATE that reports it released."""
     faults = (FaultInjection.parse("letgo@0.7"),)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
-    rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
+    rehearsal = Rehearsal(
+        session, Emulator(scenario, faults), lambda ages: link_couplings, faults, operator=Operator(True, 9.0)
+    )
     rehearsal.emulator.device.deadman = False
     rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
@@ -112,19 +114,19 @@ def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
     assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.STOPPED]
 
 
-def test_a_release_before_full_gain_ends_the_session(scenario, rungs):
+def test_a_release_before_full_gain_ends_the_session(scenario, link_couplings):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     faults = (FaultInjection.parse("letgo@0"),)
-    rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)
+    rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: link_couplings, faults)
     rehearsal.run_until_armed(0.5)
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "device deadman:")
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
 @pytest.mark.slow
-def test_any_key_shows_that_somebody_is_there(scenario, rungs):
+def test_any_key_shows_that_somebody_is_there(scenario, link_couplings):
     operator = Operator(True, 10.0, lambda: False)
-    rehearsal = rehearsal_of(scenario, rungs, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator)
     for _ in range(5):
         session = rehearsal.run_until_armed(0.0) if rehearsal.armed_us is None else rehearsal.session
         rehearsal.run(1e-6 * session.now + 0.7)
@@ -198,10 +200,10 @@ def test_a_reset_device_keeps_the_deadman_held(scenario):
     assert emulator.device.deadman
 
 
-def rehearsal_until_finished(scenario, rungs):
+def rehearsal_until_finished(scenario, link_couplings):
     """Return a session that was armed and has finished."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: link_couplings)
     rehearsal.run_until_armed(0.3)
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.5)
@@ -209,9 +211,9 @@ def rehearsal_until_finished(scenario, rungs):
 
 
 @pytest.mark.parametrize(("by_cap", "advice"), [(True, "raise --force-cap"), (False, "Raise --energy-budget")])
-def test_a_second_of_cut_forces_is_no_finish(scenario, rungs, by_cap, advice):
+def test_a_second_of_cut_forces_is_no_finish(scenario, link_couplings, by_cap, advice):
     """A session ends as stopped if cap or budget reduced the forces in over half of the 833 ticks of any second."""
-    session = rehearsal_until_finished(scenario, rungs)
+    session = rehearsal_until_finished(scenario, link_couplings)
     for cut, stage in ((400, "finished"), (450, "stopped")):
         recorder, state = Recorder(2), session.link.last
         for k in range(4000):
@@ -272,9 +274,9 @@ def test_the_incident_log_survives_sigkill(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_incident_log_grows_every_second(scenario, rungs, tmp_path):
+def test_the_incident_log_grows_every_second(scenario, link_couplings, tmp_path):
     log = IncidentLog(tmp_path / "log")
-    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
+    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 2.0))
     log.attach(rehearsal.session)
     steer = rehearsal.operator.decide
     rehearsal.operator.decide = lambda session, now: (log.update(session), steer(session, now))[1]

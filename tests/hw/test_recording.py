@@ -36,10 +36,10 @@ def test_missing_samples_are_filled_by_a_straight_line():
 
 
 @pytest.fixture(scope="module")
-def trace(scenario, rungs, tmp_path_factory):
+def trace(scenario, link_couplings, tmp_path_factory):
     """Return the files and the recorder of a session over a line that loses STATEs."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, "up:drop=0.05@0.3", recorder=recorder)
+    rehearsal = rehearsal_of(scenario, link_couplings, "up:drop=0.05@0.3", recorder=recorder)
     session = rehearsal.run_until_armed(1.0)
     session.stop("enough", session.now)
     rehearsal.run_to_the_end(2.5)
@@ -88,8 +88,8 @@ def test_the_replay_command_says_identical(trace, capsys):
         replay_command.main(["nowhere.npz"])
 
 
-def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
-    simulation = assemble(scenario, rungs[0].chosen.coupling)
+def test_a_trace_of_sim_run_is_no_session(scenario, link_couplings, tmp_path):
+    simulation = assemble(scenario, link_couplings[0].chosen.coupling)
     path = run(simulation, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
     with pytest.raises(InputError, match="a trace without data of a link"):
         load(path)
@@ -176,7 +176,7 @@ def test_damaged_traces_raise_only_input_errors(trace, tmp_path):
 
 
 @pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
-def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
+def test_steady_ticks_end_where_a_force_is_cut(scenario, link_couplings, cap, slew):
     """Steady ticks end 0 to 2 ticks after the session first counts a cut by cap or by slew rate.
 
     Trace and counters may differ, since a force that is cut by less than a step is sent unchanged.
@@ -190,7 +190,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
         cuts.append(session.counters.clipped + session.counters.slowed)
 
     session.record = record
-    Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(0.9)
+    Rehearsal(session, Emulator(scenario), lambda ages: link_couplings).run_until_armed(0.9)
     ((first, stop),) = recorder.steady_ticks(session.units.force_step, session.limits)
     assert (recorder.link()["gain"][first:] == 1.0).all()
     full = np.diff(cuts, prepend=0)[first:]
@@ -288,11 +288,11 @@ def test_the_report_is_json_and_names_its_end(trace):
     assert decisive(report)["certified"]
 
 
-def test_a_session_without_forces_keeps_no_older_files(scenario, rungs, tmp_path):
+def test_a_session_without_forces_keeps_no_older_files(scenario, link_couplings, tmp_path):
     recorder, old = Recorder(2), [tmp_path / name for name in ("trace.npz", "trace.csv", "figure.png")]
     for file in old:
         file.touch()
-    session = rehearsal_of(scenario, rungs, recorder=recorder).session
+    session = rehearsal_of(scenario, link_couplings, recorder=recorder).session
     session.stop("enough", session.now)
     files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), plot=True)
     assert files == [*tmp_path.iterdir()] == [tmp_path / "report.json"]

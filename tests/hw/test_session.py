@@ -87,7 +87,7 @@ def one_of_each_kind():
         for i, case in enumerate(one_of_each_kind())
     ],
 )
-def test_every_fault_ends_where_it_must(case, scenario, rungs, harmless, free_handles):
+def test_every_fault_ends_where_it_must(case, scenario, link_couplings, harmless, free_handles):
     """Stage, cause, time to zero force and counters are right; no force exceeds the cap; nothing arms again.
 
     Late faults strike forks of one session. Two of three cases are slow, and those that need a design. `make validate`
@@ -96,19 +96,19 @@ def test_every_fault_ends_where_it_must(case, scenario, rungs, harmless, free_ha
     if begins_late(case):
         outcome = in_fork(rehearse_late_case, case, free_handles if case.free else harmless)
     else:
-        outcome = _rehearse_case(case, scenario, rungs)[1]
+        outcome = _rehearse_case(case, scenario, link_couplings)[1]
     assert outcome.wrong == ()
 
 
-def test_a_cable_pulled_after_the_end_changes_nothing(scenario, rungs):
-    rehearsal = rehearsal_of(scenario, rungs, "motor=-1", "unplug@0.5")
+def test_a_cable_pulled_after_the_end_changes_nothing(scenario, link_couplings):
+    rehearsal = rehearsal_of(scenario, link_couplings, "motor=-1", "unplug@0.5")
     rehearsal.run_until_armed(0.6)
     assert rehearsal.run(1e-6 * rehearsal.armed_us + 0.6).stage == Stage.STOPPED
 
 
-def test_devices_with_free_handles_are_armed(scenario, rungs):
+def test_devices_with_free_handles_are_armed(scenario, link_couplings):
     """A device that nobody holds is armed, so tests/checks/faults.py prints true speeds of free handles."""
-    session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
+    session = _rehearse_case(CASES[0], scenario, link_couplings, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 
 
@@ -188,8 +188,8 @@ def test_devices_that_contradict_the_session_are_stopped(harmless, change, cause
     in_fork(contradict)
 
 
-def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
-    rehearsal = rehearsal_of(scenario, rungs, arm=False)
+def test_a_device_that_arms_by_itself_is_stopped(scenario, link_couplings):
+    rehearsal = rehearsal_of(scenario, link_couplings, arm=False)
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     last = session.link.last
@@ -198,8 +198,8 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "armed itself:")
 
 
-def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
-    rehearsal = rehearsal_of(scenario, rungs, arm=False)
+def test_without_arming_no_force_is_ever_asked_for(scenario, link_couplings):
+    rehearsal = rehearsal_of(scenario, link_couplings, arm=False)
     rehearsal.emulator.plant.begin()  # the person still moves
     sent = []
     receive = rehearsal.emulator.receive
@@ -244,14 +244,14 @@ def test_random_bytes_move_nothing(scenario):
 # the exact engine
 
 
-def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
+def test_bridge_and_emulator_reproduce_the_exact_run(scenario, link_couplings):
     """Both devices over the whole link move as in sim's exact engine with ideal encoders and forces.
 
     Positions agree to one encoder step: rounding is half a step, and rounded forces add less than the other half.
     Forces agree to the sum of K times an encoder step, B times an encoder step per tick, and one force step.
     """
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
+    rehearsal = rehearsal_of(scenario, link_couplings, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(1.7)
     emulator = rehearsal.emulator
     link, begun = recorder.link(), emulator.begun_at
@@ -259,8 +259,8 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert link["received"].all()
     assert (link["gain"][first:] == 1.0).all()
     n = len(recorder) - first
-    exact = run(assemble(scenario, rungs[0].chosen.coupling), "exact", ticks=n)
-    step, coupling = 1e-6, rungs[0].chosen.coupling
+    exact = run(assemble(scenario, link_couplings[0].chosen.coupling), "exact", ticks=n)
+    step, coupling = 1e-6, link_couplings[0].chosen.coupling
     assert n > 900
     assert np.abs(exact.s[:, :2]).max() > 5e-3  # the people do move
     assert np.abs(link["x"][first:] - exact.s[:, :2]).max() < step
@@ -269,14 +269,14 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert np.abs(forces - exact.f).max() < bound
 
 
-def test_sessions_equal_a_simulation_that_rounds(scenario, rungs):
+def test_sessions_equal_a_simulation_that_rounds(scenario, link_couplings):
     """The session equals a separate loop: plant with held forces, rounded encoders, F with delays, rounded forces."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
+    rehearsal = rehearsal_of(scenario, link_couplings, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(1.1)
     link = recorder.link()
     first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
-    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    simulation = assemble(scenario, link_couplings[0].chosen.coupling)
     held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
     w, law = outside_forces(scenario, simulation.scene, 0, n), _HostController(Law(simulation.F))
@@ -339,8 +339,8 @@ def test_the_link_delay_is_a_guarded_quantile(ages, expected):
     assert Ages(tuple(ages)).link_delay(1200.0, 0.99, 100.0) == expected
 
 
-def test_reserves_are_softer_and_certified(scenario, rungs):
-    fast, soft = rungs
+def test_reserves_are_softer_and_certified(scenario, link_couplings):
+    fast, soft = link_couplings
     assert (fast.scenario.theta, soft.scenario.theta) == ((1, 2), (2, 2))
     assert (fast.link, soft.link) == (1, 2)
     assert fast.certified
@@ -348,11 +348,11 @@ def test_reserves_are_softer_and_certified(scenario, rungs):
     assert max(soft.chosen.coupling.K) < max(fast.chosen.coupling.K)
 
 
-def test_the_host_and_the_link_share_the_delay(scenario, rungs):
+def test_the_host_and_the_link_share_the_delay(scenario, link_couplings):
     """The host's controller, delayed by the link, is the F that was certified."""
     z = np.exp(1j * np.linspace(0.01, 3, 50))
-    F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
-    on_host = rungs[0].controller((12.0, 12.0)).F.at(z) * z[:, None, None] ** -rungs[0].link
+    F = assemble(link_couplings[0].scenario, link_couplings[0].chosen.coupling).F
+    on_host = link_couplings[0].controller((12.0, 12.0)).F.at(z) * z[:, None, None] ** -link_couplings[0].link
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # the sums have different orders
 
 
@@ -369,7 +369,7 @@ def test_long_delays_wait_in_the_host(scenario):
     assert session.config.theta == made.link == 15
 
 
-def test_nothing_uncertified_is_loaded(scenario, rungs):
+def test_nothing_uncertified_is_loaded(scenario, link_couplings):
     with pytest.raises(SafetyStop, match=r"published .* theta = \[1, 2\]: any-environment needs 7.629"):
         certified_coupling(scenario, "I", "published", None, 1)
     with pytest.raises(SafetyStop, match="at most theta = 15"):
@@ -381,13 +381,13 @@ def test_nothing_uncertified_is_loaded(scenario, rungs):
 
 
 @pytest.mark.slow
-def test_reserves_take_over_after_arming(scenario, rungs):
+def test_reserves_take_over_after_arming(scenario, link_couplings):
     """After 10 % late answers the session ramps out and loads the next coupling; only arm() brings forces back."""
     faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
-    rehearsal = Rehearsal(session_with(scenario), Emulator(scenario), lambda ages: rungs, faults)
+    rehearsal = Rehearsal(session_with(scenario), Emulator(scenario), lambda ages: link_couplings, faults)
     session = rehearsal.run_until_armed(1.2)
     assert session.stage == Stage.DISARMED
-    assert session.program is rungs[1]
+    assert session.program is link_couplings[1]
     rehearsal.run(3.0)
     assert session.stage == Stage.DISARMED
     assert not any(np.any(m.applied) for m in rehearsal.moments[-800:])
@@ -407,12 +407,12 @@ def optimal_rungs(scenario):
         return certified_couplings(scenario, "I", "optimal", None, 1, spare=1)
 
 
-def assert_in_reserve(rungs):
+def assert_in_reserve(link_couplings):
     """Check each reserve: it is softer where its delay is longer, and stiffer nowhere.
 
     In the loop with the longer delay, it needs less damping than the coupling before it, and no more than available.
     """
-    for before, reserve in pairwise(rungs):
+    for before, reserve in pairwise(link_couplings):
         loop, slower = (made.scenario.loop("I") for made in (before, reserve))
         later = np.greater(slower.theta, loop.theta)
         assert later.any()
@@ -443,11 +443,11 @@ def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
 def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_path):
     path = tmp_path / "stiff.json"
     save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
-    rungs = certified_couplings(scenario, "I", str(path), None, 1)
-    assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
-    assert [r.link for r in rungs] == [1, 2, 3]
-    assert all(r.certified for r in rungs)
-    assert_in_reserve(rungs)
+    link_couplings = certified_couplings(scenario, "I", str(path), None, 1)
+    assert [r.chosen.kind for r in link_couplings] == ["stiff.json", "spring-damper", "spring-damper"]
+    assert [r.link for r in link_couplings] == [1, 2, 3]
+    assert all(r.certified for r in link_couplings)
+    assert_in_reserve(link_couplings)
     with pytest.raises(SafetyStop, match=r"stiff\.json .* theta = \[2, 2\]"):
         certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
 
@@ -516,12 +516,12 @@ def test_second_faults_change_counts_of_the_first(scenario, second, shown):
 
 
 @pytest.mark.slow
-def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
+def test_limited_forces_replay_under_their_guarantee(scenario, link_couplings, tmp_path):
     """With caps of 0.3 and 0.2 N, the limiter keeps forces within the caps and acts in over a third of the ticks."""
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
     session.record = recorder
-    Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
+    Rehearsal(session, Emulator(scenario), lambda ages: link_couplings).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
     limits = report.assessment.force_limits
     assert limits.proved
@@ -546,10 +546,10 @@ class _Thief:
 
 
 @pytest.mark.slow
-def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tmp_path):
+def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, link_couplings, tmp_path):
     recorder = Recorder(2)
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
-    run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
+    run = rehearsal_of(scenario, link_couplings, recorder=recorder, settings=settings)
     run.run_to_the_end(1.2)
     (part,) = outcome("I", run.session, recorder, 0).energy_budget
     assert part.limited_ticks == part.surprises == 0
@@ -558,12 +558,12 @@ def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tm
     assert part.reserved_J <= part.energy_J
 
 
-def test_sessions_with_forces_cut_by_the_budget_stop(scenario, rungs, monkeypatch):
+def test_sessions_with_forces_cut_by_the_budget_stop(scenario, link_couplings, monkeypatch):
     """The budget limits most forces of an active controller, and the record has every tick in which it does."""
     monkeypatch.setattr("haptic_loop.hw.control.host_controller", lambda scenario, *given: _Thief(scenario.T))
     recorder, stop = Recorder(2), (0.8, lambda session, now: session.stop("asked to", now))
     settings = LinkSettings(measure=100, energy_budget=(0.01, np.inf))
-    run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings, actions=[stop])
+    run = rehearsal_of(scenario, link_couplings, recorder=recorder, settings=settings, actions=[stop])
     assert run.run_to_the_end(3.0).stage == Stage.FINISHED
     report = outcome("I", run.session, recorder, 0)
     assert recorder.link()["limited"].sum() == report.energy_budget[0].limited_ticks > 200
@@ -572,7 +572,7 @@ def test_sessions_with_forces_cut_by_the_budget_stop(scenario, rungs, monkeypatc
 
 
 @pytest.mark.slow
-def test_the_bridges_budget_limits_an_active_controller(scenario, rungs, monkeypatch, tmp_path):
+def test_the_bridges_budget_limits_an_active_controller(scenario, link_couplings, monkeypatch, tmp_path):
     """The budget limits an active controller over a lossy line, and the replay repeats this bit by bit."""
     for module in ("control", "recording"):
         monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
@@ -580,7 +580,7 @@ def test_the_bridges_budget_limits_an_active_controller(scenario, rungs, monkeyp
     for budget in (0.01, 10.0):
         recorder = Recorder(2)
         settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
-        run = rehearsal_of(scenario, rungs, "down:drop=0.02@0.5", recorder=recorder, settings=settings)
+        run = rehearsal_of(scenario, link_couplings, "down:drop=0.02@0.5", recorder=recorder, settings=settings)
         run.run_to_the_end(1.3)
         report = outcome("I", run.session, recorder, 0)
         (part,) = report.energy_budget

@@ -123,7 +123,7 @@ def test_any_environment_requires_the_same_in_all_cells():
 
 
 @pytest.mark.slow
-def test_hands_grow_as_in_exact_loops(optimal):
+def test_hands_growth_rates_equal_those_of_exact_loops(optimal):
     """HeldDevices gives each set of hands the growth rate of the exact loop with the force map of the cell."""
     sweep = around(PAIR, optimal["omega-pair"])
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 1, 12, 1)
