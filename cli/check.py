@@ -13,7 +13,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.ranges import where_proved
 from haptic_loop.controller.units import set_unit
-from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
+from haptic_loop.design.assessment import Assessment, assess, violated_between
 from haptic_loop.design.certificate import (
     NotProved,
     Verdict,
@@ -29,7 +29,7 @@ from haptic_loop.design.certificate import (
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
-from haptic_loop.design.result import CONDITIONS, RANGES, listed, suffices, switching_guarantee
+from haptic_loop.design.result import CONDITIONS, RANGES, Chosen, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search_ranges
 from haptic_loop.sim.couplings import read_coupling
 
@@ -57,7 +57,7 @@ class _Checked:
     loop: str = render.figure("loop")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
-    between: SearchFigures | None = render.figure("between vertices")
+    between: Searched | None = render.figure("between vertices")
     required_damping: Sequence[float] | None = render.figure("required damping [N s/m]", listed)
     available_damping: Sequence[float] = render.figure("available damping [N s/m]", listed)
     margin: float | None = render.figure("margin", "{:.6g}")
@@ -120,10 +120,8 @@ def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
 def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) -> Assessment | None:
     claim = stored.certificate
     assert claim
-    condition = own or claim.condition
-    ranges = searched if stored.loop.ranges else None
-    built = stored.built()
-    return assess(stored.loop, built, certificate=claim, condition=condition, ranges_samples=0, searched=ranges)
+    proved = Chosen(stored.built(), claim.condition, own=own, certificate=claim, searched=searched)
+    return assess(stored.loop, proved, ranges_samples=0)
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
@@ -159,7 +157,7 @@ def _checked(
         "; ".join([f"T = {1e3 * loop.T:.6g} ms, {delays}, exact positions", *(covered(loop, claim) if claim else ())]),
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
-        searched and SearchFigures.of(searched),
+        searched,
         claim and claim.required,
         loop.delta,
         claim and claim.margin,

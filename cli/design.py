@@ -228,13 +228,9 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
     with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
         assessment = assess(
             loop,
-            design.coupling,
-            certificate=design.certificate,
-            condition=design.required_condition,
+            design,
             ranges_seed=args.seed,
-            searched=design.searched,
             limiter=args.limiter,
-            limiter_c=design.c,
             force_limit=tuple(device.force_limit for device in scenario.axis_devices),
             band_hz=args.band_hz or BAND_HZ,
             progress=move,

@@ -9,7 +9,6 @@ run. If one of them changes, `assess` must be called again.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -57,14 +56,13 @@ from haptic_loop.design.result import (
     HERE,
     KNOWN_CONDITIONS,
     RANGES,
-    Design,
+    Chosen,
     NotProved,
     Requirement,
     held_torques,
-    suffices,
 )
 from haptic_loop.design.transparency import BAND_HZ, Transparency, in_band, silent, transparency
-from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
+from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
 #: A user's function u -> force (m,) [N]. u (m,) [m] are the environment's displacements without this tick's force.
 PluggedEnvironment = Callable[[Array], Array]
@@ -139,36 +137,10 @@ class RangesResult:
             "worst": member.name,
             "proof": "rational" if self.certificate else "sampled",
             "certified": self.proved,
-            "search": SearchFigures.of(self.searched),
+            "search": self.searched,
             "inside": inside,
         }
         return part | ({"reason": self.reason} if self.reason else {})
-
-
-@dataclass(frozen=True)
-class SearchFigures:
-    """The figures of the search between the vertices, which is evidence and no proof."""
-
-    environments: int  # number of environments that were tried
-    worst_ratio: float  # required over available damping in the worst environment
-    worst: str  # name of the worst environment
-    violated: bool  # whether the worst environment violates the condition
-    ended_early: bool  # whether a limit of time or work ended the search
-    ended_by_clock: bool  # whether the user's time limit (--seconds) ended the search
-    how: str = SEARCH  # the places that the search covers, in words
-
-    @classmethod
-    def of(cls, searched: Searched) -> SearchFigures:
-        worst, ended = searched.worst[0], searched.ended
-        violated = not suffices(worst.ratio)
-        return cls(searched.tried, worst.ratio, worst.member.name, violated, ended is not None, ended == "clock")
-
-    def __str__(self) -> str:
-        verdict = "[red]violated[/]" if self.violated else "no violation found"
-        ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else "no damping is enough"
-        limit = "--seconds" if self.ended_by_clock else "its budget of counted work"
-        ended = f", until {limit} ended the search" if self.ended_early else ""
-        return f"searched, not proved: {verdict}, {ratio} in {self.environments} points{ended}; worst: {self.worst}"
 
 
 def check_ranges(
@@ -490,11 +462,6 @@ class Guarantee:
         return self.environments == ANY
 
     @property
-    def counts_positions(self) -> bool:
-        """Whether the guarantee depends on exact positions; an energy budget at the devices does not."""
-        return self.proof != "account"
-
-    @property
     def words(self) -> str:
         """The environments, the bound of the energy, the user's own condition, and the limits by encoder steps."""
         by = f", by the condition {self.own}, which is your own" if self.own else ""
@@ -568,14 +535,26 @@ class Assessment:
         """Return the assessment for devices with these encoder steps, which restrict its guarantee."""
         guarantee = self.guarantee
         if guarantee:
-            limits = encoder.suffix if encoder and guarantee.counts_positions else ""
+            # The guarantee of an energy budget at the devices does not depend on exact positions.
+            limits = encoder.suffix if encoder and guarantee.proof != "account" else ""
             guarantee = replace(guarantee, positions=limits)
         return replace(self, encoder=encoder, guarantee=guarantee)
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """The loop's properties beyond constant delays, equal periods and one linear environment."""
-        return _facts_of(self.loop, self.environment, self.force_limits)
+        """The loop's properties beyond constant delays, equal periods and one linear environment, in fixed order."""
+        loop, plugged = self.loop, shelled(self.environment)
+        there = {
+            KNOWN_DEVICE.name: loop.known_devices,
+            "periods": loop.T_max not in (None, loop.T),
+            "latency": loop.latency,
+            "switching": loop.varying_delay,
+            "walls": not plugged and getattr(self.environment, "walls", ()),
+            "ranges": not plugged and loop.ranges,
+            "shell": plugged,
+            "limiter": self.force_limits.rho is not None,
+        }
+        return tuple(name for name, present in there.items() if present)
 
     @property
     def decisive(self) -> Requirement:
@@ -625,7 +604,7 @@ class Assessment:
 @one_blas_thread
 def assess(
     loop: Loop,
-    coupling: Coupling | Design,
+    coupling: Coupling | Chosen,
     *,
     environment: Environment | PluggedEnvironment | None = None,
     energy_budget: float | None = None,
@@ -633,10 +612,7 @@ def assess(
     condition: str | Condition | None = None,
     ranges_seed: int = 0,
     ranges_samples: int = _SAMPLES,
-    searched: Searched | None = None,
     limiter: bool | None = None,
-    limiter_proof: Certificate | None = None,
-    limiter_c: Sequence[Sequence[float]] | None = None,
     force_limit: Sequence[float] = (),
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
@@ -645,7 +621,9 @@ def assess(
 
     Args:
         loop: The loop, with its ranges, switching delays, latency and longest period.
-        coupling: The coupling as it runs; a Design also supplies its condition, certificate, search and limiter_c.
+        coupling: The coupling as it runs. A Chosen or a Design also supplies its condition, its certificates, its
+            search between the vertices of ranges, and the multipliers `c` of its limiter. If these do not cover limited
+            forces in this loop, others are searched.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
         energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
@@ -657,11 +635,7 @@ def assess(
             guarantee.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
-        searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
-        limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
-        limiter_c: Multipliers of the limiter, one row per device, which a design has found. Without a `limiter_proof`,
-            others are searched only if these certify no limiter; known-device does not use them.
         force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
         progress: Called with (done, total) of the conditions, and then of the points of a search over ranges.
@@ -681,17 +655,18 @@ def assess(
         of_kind("environment", environment, Environment, "a Network, your own Environment or a function")
     if energy_budget is not None:
         energy_budget = check_start("energy_budget", number("energy_budget", energy_budget, "an energy in J"))
-    for name, proof in (("certificate", certificate), ("limiter_proof", limiter_proof)):
-        if proof is not None:
-            of_kind(name, proof, Certificate, "a Certificate, as prove(loop, coupling, condition) gives it")
+    if certificate is not None:
+        of_kind("certificate", certificate, Certificate, "a Certificate, as prove(loop, coupling, condition) gives it")
     ranges_seed, ranges_samples = whole("ranges_seed", ranges_seed, 0), whole("ranges_samples", ranges_samples, 0)
     force_limit = _checked_limits(force_limit, loop.channels)
     in_band(band_hz, loop.T)
-    if isinstance(coupling, Design):
-        certificate, condition = certificate or coupling.certificate, condition or coupling.required_condition
-        proof = coupling.certificate  # The design's search is for this loop only if its proof is.
-        own_search = coupling.searched if proof and proof.scenario == digest(loop, coupling.coupling.form()) else None
-        searched, limiter_c, coupling = searched or own_search, limiter_c or coupling.c, coupling.coupling
+    searched = limiter_proof = limiter_c = None
+    if isinstance(coupling, Chosen):
+        proof, limiter_proof, limiter_c = coupling.certificate, coupling.limiter, coupling.c
+        certificate, condition = certificate or proof, condition or coupling.required_condition
+        if proof and proof.scenario == digest(loop, coupling.coupling.form()):
+            searched = coupling.searched  # The search is for this loop only if the proof is.
+        coupling = coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
     require_channels(coupling.form(), loop.channels)
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
@@ -713,10 +688,12 @@ def assess(
     plugged = shelled(network if environment is None else environment)
     if plugged:
         limits = ForceLimits(None, "the forces of the environment are clipped before the shell")
+    elif limiter is False:
+        limits = ForceLimits(None, "the limiter is switched off")
     else:
         where = loop if environment is None else loop.at(network)
         covering = {own.name: requirements[own.name]} if own else requirements
-        limits = _force_limits(where, coupling, covering, limiter, limiter_proof, known, limiter_c)
+        limits = _covered_limits(where, coupling, covering, limiter_proof, known, limiter_c)
     if plugged and energy_budget is None:
         energy_budget = 0.0 if callable(environment) else START_J
     if energy_budget is not None:
@@ -784,20 +761,6 @@ def _checked_limits(force_limit: Sequence[float], channels: int) -> tuple[float,
     return limits
 
 
-def _force_limits(
-    loop: Loop,
-    coupling: Coupling,
-    requirements: Mapping[str, Requirement],
-    limiter: bool | None,
-    proof: Certificate | None,
-    known: Certificate | None,
-    c: Sequence[Sequence[float]] | None,
-) -> ForceLimits:
-    if limiter is False:
-        return ForceLimits(None, "the limiter is switched off")
-    return _covered_limits(loop, coupling, requirements, proof, known, c)
-
-
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:
     """Return the mismatch of F and E with all walls touching, or None if it cannot be computed."""
     try:
@@ -815,25 +778,6 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
 def shelled(environment: Environment | PluggedEnvironment) -> bool:
     """Return whether an environment runs behind the energy shell: a plugged-in function or a MuJoCo scene."""
     return callable(environment) or getattr(environment, "world", None) is not None
-
-
-def _facts_of(
-    loop: Loop, environment: Environment | PluggedEnvironment | None = None, limits: ForceLimits | None = None
-) -> tuple[str, ...]:
-    """Return the loop's properties beyond constant delays, equal periods and one linear environment, in fixed order."""
-    network = loop.environment if environment is None or callable(environment) else environment
-    plugged = shelled(network if environment is None else environment)
-    there = {
-        KNOWN_DEVICE.name: bool(loop.known_devices),
-        "periods": loop.T_max not in (None, loop.T),
-        "latency": bool(loop.latency),
-        "switching": bool(loop.varying_delay),
-        "walls": bool(network.walls) and not plugged,
-        "ranges": bool(loop.ranges) and not plugged,
-        "shell": plugged,
-        "limiter": bool(limits and limits.rho is not None),
-    }
-    return tuple(name for name, present in there.items() if present)
 
 
 _EVERYONE = "every passive hand"

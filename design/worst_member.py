@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member, Region, regions
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import ratio_in
+from haptic_loop.design.result import suffices
 
 _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
@@ -31,9 +32,6 @@ _SEED = 0xFACE
 _MANY = 7  # With more parameters, vertices, points on edges and points inside are drawn at random, and none on faces.
 _APART, _SAME = 0.2, 0.05  # least distances of two starts of the compass search and of two maxima, in range widths
 _FIRST, _LAST = 1 / 16, 1 / 128  # first step for up to _MANY parameters, and last step, in range widths
-
-#: the search in words, for reports
-SEARCH = "along edges, on faces (up to 7 parameters) and inside, then uphill from the worst points"
 
 
 @dataclass(frozen=True)
@@ -46,11 +44,32 @@ class _Worst:
 
 @dataclass(frozen=True)
 class Searched:
-    """The local maxima that a search found, with the largest first."""
+    """The local maxima that a search found, with the largest first. They are evidence and no proof."""
 
     worst: tuple[_Worst, ...]
     tried: int  # number of members tried
     ended: Literal["work", "clock"] | None = None  # what ended the search early: its budget, or the user's time limit
+
+    def part(self) -> dict[str, Any]:
+        """Return the search as fields for JSON; `violated` says whether the worst member violates the condition."""
+        worst = self.worst[0]
+        return {
+            "environments": self.tried,
+            "worst_ratio": worst.ratio,
+            "worst": worst.member.name,
+            "violated": not suffices(worst.ratio),
+            "ended_early": self.ended is not None,
+            "ended_by_clock": self.ended == "clock",
+            "how": "along edges, on faces (up to 7 parameters) and inside, then uphill from the worst points",
+        }
+
+    def __str__(self) -> str:
+        worst = self.worst[0]
+        verdict = "no violation found" if suffices(worst.ratio) else "[red]violated[/]"
+        ratio = f"worst ratio {worst.ratio:.4f}" if np.isfinite(worst.ratio) else "no damping is enough"
+        limit = "--seconds" if self.ended == "clock" else "its budget of counted work"
+        ended = f", until {limit} ended the search" if self.ended else ""
+        return f"searched, not proved: {verdict}, {ratio} in {self.tried} points{ended}; worst: {worst.member.name}"
 
 
 def search(

@@ -226,15 +226,11 @@ def assessed(
     """
     assessment = assess(
         scenario.loop(case),
-        chosen.coupling,
+        chosen,
         environment=environment,
         energy_budget=energy_budget,
-        certificate=chosen.certificate,
-        condition=chosen.required_condition,
         ranges_seed=seed,
         limiter=limiter,
-        limiter_proof=chosen.limiter,
-        limiter_c=chosen.c,
         force_limit=tuple(device.force_limit for device in scenario.axis_devices),
         band_hz=band_hz,
         progress=progress,

@@ -24,7 +24,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, ThisEnvironment
-from haptic_loop.design.result import HERE, RANGES, Design, NotProved, listed
+from haptic_loop.design.result import HERE, RANGES, Chosen, Design, NotProved, listed
 from haptic_loop.design.robustness import ranges_around
 from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
@@ -147,7 +147,6 @@ def test_reports_name_no_force_if_none_is_declared():
         ({"ranges_samples": 0.5}, "ranges_samples is 0.5 (float)"),
         ({"environment": 3}, "environment is 3 (int), expected"),
         ({"certificate": 3}, "certificate is 3 (int), expected"),
-        ({"limiter_proof": 3}, "limiter_proof is 3 (int), expected"),
         ({"condition": 3}, "condition is 3 (int), expected"),
         ({"band_hz": (3, 1)}, "band_hz is [3, 1], expected two rising frequencies in Hz"),
         ({"band_hz": (5000, 6000)}, "band_hz is [5000, 6000]"),
@@ -241,7 +240,7 @@ def test_a_swept_limiter_makes_the_guarantee_sampled(monkeypatch):
 def test_wrong_multipliers_of_a_limiter_are_replaced(wrong):
     """Multipliers 0 and 4 do not certify this coupling with limited forces, and two multipliers are for two devices."""
     right, none = ((0.75,),), None
-    c = [assess(LOOP, HERE_ONLY, limiter_c=c).force_limits.c for c in (right, wrong, none)]
+    c = [assess(LOOP, Chosen(HERE_ONLY, "this-environment", c=c)).force_limits.c for c in (right, wrong, none)]
     assert c[0] == right
     assert c[1] == c[2]
 
@@ -251,11 +250,11 @@ def test_a_stored_limiter_proof_covers_no_longer_delay():
     """The stored proof is for a delay of 1 sample. With 801 samples the loop has too many states for a proof."""
     loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
     coupling = SpringDamper([1.0], [0.01])
-    on_file = prove(loop, coupling, LIMITER)
-    longer = assess(change(loop, theta=(801,)), coupling, limiter_proof=on_file, force_limit=(4.0,))
+    on_file = Chosen(coupling, "this-environment", limiter=prove(loop, coupling, LIMITER))
+    longer = assess(change(loop, theta=(801,)), on_file, force_limit=(4.0,))
     assert longer.requirements["this-environment"].certified
     assert (longer.guarantee.proof, longer.force_limits.proved) == ("sampled", False)
-    assert assess(loop, coupling, limiter_proof=on_file).force_limits.proved
+    assert assess(loop, on_file).force_limits.proved
 
 
 def test_lost_packets_end_the_guarantee():
@@ -431,7 +430,8 @@ def test_a_search_of_another_condition_is_repeated(monkeypatch):
     bounds = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),)
     loop = change(ALONE, ranges=ranges_around(SPRING, 10.0), known_devices=bounds)
     searched, proof = search_ranges(loop, NoCoupling()), prove(loop, NoCoupling(), THIS_ENVIRONMENT)
-    assessed = assess(loop, NoCoupling(), certificate=proof, searched=searched, ranges_samples=0)
+    chosen = Chosen(NoCoupling(), "known-device", certificate=proof, searched=searched)
+    assessed = assess(loop, chosen, ranges_samples=0)
     assert assessed.ranges.worst[1].condition == "known-device"
     assert assessed.ranges.searched is not searched
 

@@ -14,7 +14,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from haptic_loop.design import budgets, optimal
 from haptic_loop.design.api import certify, store
-from haptic_loop.design.assessment import SearchFigures, check_ranges
+from haptic_loop.design.assessment import check_ranges
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.program import Options
@@ -130,10 +130,10 @@ def test_many_parameters_find_the_worst_vertex():
     assert not result.ended
     short = search([region], need, work=-1.0)
     assert short.ended == "work"
-    assert "counted work ended" in str(SearchFigures.of(short))
+    assert "counted work ended" in str(short)
     late = search([region], need, over=lambda: True)
     assert late.ended == "clock"
-    assert "--seconds ended" in str(SearchFigures.of(late))
+    assert "--seconds ended" in str(late)
     assert short.tried == 1
     assert len(short.worst) == 1
 
@@ -184,7 +184,7 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
         assert all(r.certified for r in known.at_samples)
     assert not known.proved
     part = known.part()
-    assert (part["proof"], part["certified"], part["search"].violated) == ("rational", False, True)
+    assert (part["proof"], part["certified"], part["search"].part()["violated"]) == ("rational", False, True)
     assert part["reason"].startswith("proved at every vertex, but violated between them: 1.04")
 
 
