@@ -20,7 +20,7 @@ def session_with(scenario, settings=FAST):
 
 
 def rehearsal_of(scenario, couplings, *faults, recorder=None, settings=FAST, **options):
-    """Return a rehearsal with the certified couplings `link_couplings`, and faults written as for --fault."""
+    """Return a rehearsal with these certified couplings, and faults written as for --fault."""
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_with(scenario, settings)
     if recorder is not None:

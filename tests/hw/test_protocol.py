@@ -146,7 +146,7 @@ def test_frames_equal_the_textbook(message):
     assert crc_bitwise(b"123456789") == 0xCBF43926  # the check value that the CRC catalogue gives for CRC-32
 
 
-def test_the_documents_example_is_what_the_code_sends():
+def test_the_code_sends_the_pages_worked_example():
     """docs/protocol.md, "A worked example": each hex line is a frame, the line above it the message."""
     text = DOC.read_text().split("## A worked example", 1)[1]
     pairs = re.findall(r"^# (\w+\(.*\))\n((?:[0-9a-f]{2} ?)+)$", text, re.M)

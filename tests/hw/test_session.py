@@ -90,8 +90,8 @@ def one_of_each_kind():
 def test_every_fault_ends_where_it_must(case, scenario, link_couplings, harmless, free_handles):
     """Stage, cause, time to zero force and counters are right; no force exceeds the cap; nothing arms again.
 
-    Late faults strike forks of one session. Two of three cases are slow, and those that need a design. `make validate`
-    runs all cases, each from its beginning (`python -m tests.checks.faults`).
+    Late faults begin in forks of one session. Two of three cases are marked slow, as are those that need a design.
+    `make validate` runs all cases, each from its beginning (`python -m tests.checks.faults`).
     """
     if begins_late(case):
         outcome = in_fork(rehearse_late_case, case, free_handles if case.free else harmless)
@@ -400,7 +400,7 @@ def test_reserves_take_over_after_arming(scenario, link_couplings):
 
 
 @pytest.fixture(scope="module")
-def optimal_rungs(scenario):
+def optimal_couplings(scenario):
     """Return optimal couplings of the first bases, without the search over larger ones."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)
@@ -424,15 +424,15 @@ def assert_in_reserve(link_couplings):
 
 
 @pytest.mark.slow
-def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
-    fast, soft = optimal_rungs
+def test_optimal_couplings_have_a_reserve(optimal_couplings, capsys):
+    fast, soft = optimal_couplings
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
     assert (fast.link, soft.link) == (1, 2)
     assert fast.assessment.requirements["this-environment"].certified
     assert soft.assessment.requirements["this-environment"].certified
-    assert_in_reserve(optimal_rungs)
+    assert_in_reserve(optimal_couplings)
     assert soft.scenario.theta == (2, 2)
-    bridge._print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
+    bridge._print_certificate(Ages((130,) * 100), 1, optimal_couplings, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out
     assert re.search(r"│ optimal, theta = 1, 2 .*rational.*this environment", table)
     assert re.search(r"│ optimal, theta = 2, 2 .*rational.*this environment", table)
@@ -440,9 +440,9 @@ def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
 
 
 @pytest.mark.slow
-def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_path):
+def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_couplings, tmp_path):
     path = tmp_path / "stiff.json"
-    save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
+    save_coupling(Stored(scenario.loop("I"), optimal_couplings[0].chosen.coupling.form()), path)
     link_couplings = certified_couplings(scenario, "I", str(path), None, 1)
     assert [r.chosen.kind for r in link_couplings] == ["stiff.json", "spring-damper", "spring-damper"]
     assert [r.link for r in link_couplings] == [1, 2, 3]
@@ -453,12 +453,12 @@ def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_reserve_armed_later_replays_bit_by_bit(scenario, optimal_rungs, tmp_path):
+def test_a_reserve_armed_later_replays_bit_by_bit(scenario, optimal_couplings, tmp_path):
     """After late answers and a ramp, a person arms the reserve. The trace of both couplings replays bit by bit."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    rehearsal = rehearsal_of(scenario, optimal_couplings, "down:jitter=0.0007@0.45", recorder=recorder)
     session = rehearsal.run_until_armed(1.2)
-    assert (session.stage, session.program) == (Stage.DISARMED, optimal_rungs[1])
+    assert (session.stage, session.program) == (Stage.DISARMED, optimal_couplings[1])
     session.arm(session.now)
     rehearsal.run(1e-6 * session.now + 0.8)
     assert session.stage == Stage.ARMED
@@ -655,7 +655,7 @@ def test_budgets_need_a_coupling_certified_without_them(scenario):
 
 @pytest.mark.parametrize(("length", "exceeded"), [(1e-3, False), (2e-3, True)])
 def test_a_budget_holds_up_to_its_longest_tick(length, exceeded):
-    """The hand moves with the force f at f/(2 delta), which in a tick costs f^2/(4 delta) times its length."""
+    """The force f moves the hand at the speed f/(2 delta), which costs the energy f^2/(4 delta) times the tick."""
     force_step, delta, start = 1e-6, 1.0, 1e-3
     budget = SentBudget(BudgetPlan(start, None, (delta,), (1e-9,), (force_step,), 1, 0, 1e-3))
     x, force, given = 0.0, 0.0, 0.0

@@ -49,7 +49,7 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
-def test_a_linear_scene_is_the_network(tmp_path, coupling):
+def test_a_linear_scene_equals_its_network(tmp_path, coupling):
     """Behind a coupling the scene sends the network's forces for one second, and u = x - V f.
 
     Tendon springs are longer by 1e-12 of 0.1 m, which is at most 8e-11 N. Rounding of lengths adds 1e-14 N a tick.
@@ -364,7 +364,7 @@ def test_scenes_mujoco_cannot_step_get_one_line(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_that_diverges_says_so(tmp_path):
+def test_a_diverging_scene_is_reported(tmp_path):
     driven = '<body name="load"><joint name="j" type="slide"/><geom size="0.1"/></body>'
     drive = '<actuator><velocity joint="j" kv="-1e5"/></actuator>'
     port = world(tmp_path, with_body(f'<body name="left" pos="0 0 1">{FREE}</body>{driven}', drive)).port()
@@ -485,7 +485,7 @@ def test_the_digest_covers_every_mesh_that_mujoco_reads(tmp_path):
         ("", "", None),
     ],
 )
-def test_parts_that_may_drive_are_listed(tmp_path, joint, more, part):
+def test_parts_that_may_add_energy_are_listed(tmp_path, joint, more, part):
     bodies = f'<body name="left">{FREE}</body><body><joint type="slide" {joint}/>{FREE}</body>'
     known = {each.what: each.at_the_port for each in world(tmp_path, with_body(bodies, more)).parts()}
     assert [what for what, at_the_port in known.items() if at_the_port == "the shell only"] == [part] * bool(part)

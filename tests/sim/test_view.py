@@ -128,7 +128,7 @@ def press(running, *names):
 # the loop itself
 
 
-def test_the_session_is_the_simulation(none):
+def test_live_frames_equal_the_simulated_run(none):
     """Frames at any times show the run up to one rounding error per tick.
 
     A block of ticks sums in another order than single ticks, and the unstable mode amplifies rounding up to sevenfold.

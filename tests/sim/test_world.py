@@ -1,4 +1,4 @@
-"""MuJoCo worlds give hands no more than their account, W0 = START_J and the energy that gravity and springs released.
+"""MuJoCo worlds give hands no more energy than the account: W0 = START_J plus what gravity and springs released.
 
 A world is a MuJoCo scene that hands touch through devices; its shell limits forces that would give more. Tolerances
 without a comment cover rounding.

@@ -27,10 +27,10 @@ ROOT = Path(__file__).parents[2]
 OUT = ROOT / "build" / "kernels"
 TESTS = ("tests/controller", "tests/design", "tests/models", "tests/sim")
 
-#: What --one runs of these: tests that rounding decides (factorizations, eigenvalues, exact proofs, designs). To choose
-#: them, functions that record their callers replaced those of numpy.linalg, scipy.linalg and LAPACK. Files are listed
-#: whole if they check such results against independent ones; single tests reach what no file does at little cost. In
-#: November 2026 these tests reached 202 of the 234 calls that all quick tests reach, in an eighth of the time.
+#: The tests of --one: those whose results depend most on rounding (factorizations, eigenvalues, exact proofs, designs).
+#: To choose them, the calls of numpy.linalg, scipy.linalg and LAPACK were recorded. Whole files are listed if they
+#: compare such results with independent ones. The single tests reach calls that no listed file reaches. When recorded,
+#: these tests reached 202 of the 234 calls that all quick tests reach, in an eighth of the time.
 ROUNDING = (
     "tests/controller/test_limiter.py",
     "tests/controller/test_lti.py",
@@ -70,7 +70,7 @@ ROUNDING = (
     "tests/design/test_spring_damper.py::test_slopes_match_finite_differences",
     "tests/design/test_spring_damper.py::test_the_least_eigenpair_solves_its_equation",
     "tests/sim/test_validate.py::test_batched_eigenvalues_are_those_of_each_loop",
-    "tests/sim/test_view.py::test_the_session_is_the_simulation",
+    "tests/sim/test_view.py::test_live_frames_equal_the_simulated_run",
     "tests/sim/test_world.py::test_matrix_levels_dissipate_as_computed_by_hand",
     "tests/sim/test_zwidth.py::test_maps_of_the_widest_plane_match_sweeps",
     "tests/sim/test_zwidth.py::test_the_linear_points_agree_with_the_eigenvalues",
