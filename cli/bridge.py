@@ -28,7 +28,7 @@ from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
-from haptic_loop.sim.couplings import NAMES, encoder_steps
+from haptic_loop.sim.couplings import NAMES, encoder_steps, stored_coupling
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
@@ -107,6 +107,8 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
     """Raise InputError for options that exclude each other, or that no certificate covers."""
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    if args.coupling and args.coupling not in NAMES and ":" not in args.coupling:
+        stored_coupling(scenario, args.coupling)  # Refuse a bad file before the link is measured.
     arrival = "--latch arrival"
     if session_cli.host_clocked(args):
         arrival = f"--port {args.port}, whose forces latch on arrival"

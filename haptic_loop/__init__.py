@@ -21,13 +21,12 @@ start quickly.
 
 from __future__ import annotations
 
-# `signal` imports enum, and Ctrl-C in this time would print a traceback.
-import _signal  # pyright: ignore[reportMissingImports]
 import os
+import signal
 import sys
 from importlib import import_module
 
-TYPE_CHECKING = False  # Importing it from typing takes time, as above.
+TYPE_CHECKING = False  # Importing it from typing takes time.
 if TYPE_CHECKING:
     from typing import Any, NoReturn
 
@@ -46,39 +45,23 @@ if TYPE_CHECKING:
     from haptic_loop.sim.trace import Trace
     from haptic_loop.sim.world import linearise
 
-_HOMES = {
-    "RIGID_WALL": "controller.environment",
-    "Assessment": "design.assessment",
-    "CompliantDevice": "models.device",
-    "Design": "design.result",
-    "DesignFailed": "design.result",
-    "DesignOptions": "design.api",
-    "Findings": "sim.crowds",
-    "Guarantee": "design.assessment",
-    "InputError": "sim.scenario",
-    "Loop": "controller.loop",
-    "Network": "controller.environment",
-    "NoCoupling": "controller.coupling",
-    "Rehearsed": "hw.rehearsal",
-    "Requirement": "design.result",
-    "RigidDevice": "models.device",
-    "Scenario": "sim.scenario",
-    "Spring": "controller.environment",
-    "SpringDamper": "controller.coupling",
-    "Trace": "sim.trace",
-    "Transparency": "design.transparency",
-    "Wall": "controller.environment",
-    "assess": "design.assessment",
-    "certify": "design.api",
-    "design_coupling": "design.api",
-    "linearise": "sim.world",
-    "load": "sim.scenario",
-    "parse": "sim.scenario",
-    "rehearse": "hw.rehearsal",
-    "simulate": "sim.api",
-    "transparency_of": "design.api",
-    "validate": "sim.api",
+_NAMES = {
+    "controller.coupling": "NoCoupling SpringDamper",
+    "controller.environment": "RIGID_WALL Network Spring Wall",
+    "controller.loop": "Loop",
+    "design.api": "DesignOptions certify design_coupling transparency_of",
+    "design.assessment": "Assessment Guarantee assess",
+    "design.result": "Design DesignFailed Requirement",
+    "design.transparency": "Transparency",
+    "hw.rehearsal": "Rehearsed rehearse",
+    "models.device": "CompliantDevice RigidDevice",
+    "sim.api": "simulate validate",
+    "sim.crowds": "Findings",
+    "sim.scenario": "InputError Scenario load parse",
+    "sim.trace": "Trace",
+    "sim.world": "linearise",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -109,8 +92,8 @@ def _leave(number: int, frame: Any) -> NoReturn:
 # takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
-    if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # cli.execute restores this handler
-        _signal.signal(_signal.SIGINT, _leave)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute restores this handler
+        signal.signal(signal.SIGINT, _leave)
 
 
 def __getattr__(name: str) -> Any:

@@ -95,12 +95,17 @@ def _choose(
         condition = condition or usual_condition(loop, name)
         further: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
         return replace(design_by_kind(loop, name, own or condition, progress, **further), kind=name)
+    stored, coupling = stored_coupling(scenario, name)
+    chosen = from_file(stored, scenario.loop(case), Path(name).name, own, coupling)
+    return replace(chosen, condition=condition or chosen.condition)
+
+
+def stored_coupling(scenario: Scenario, name: str) -> tuple[Stored, Coupling]:
+    """Return the content of FILE.json, and its coupling for the scenario. Raises InputError if they do not fit."""
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or FILE.py:NAME")
     stored = read_coupling(name)
-    coupling = fitted(stored, name, scenario.channels, scenario.T)
-    chosen = from_file(stored, scenario.loop(case), Path(name).name, own, coupling)
-    return replace(chosen, condition=condition or chosen.condition)
+    return stored, fitted(stored, name, scenario.channels, scenario.T)
 
 
 def own_of(name: str, loop: Loop) -> Chosen:

@@ -255,15 +255,6 @@ def test_ctrl_c_during_command_imports_exits_with_130(command, tmp_path):
     assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
 
 
-def test_ctrl_c_before_enum_import_exits_with_130(tmp_path):
-    """Without site, the package is the first to import enum: its handler must be there by then."""
-    (tmp_path / "enum.py").write_text(INTERRUPT.replace("signal\n", "_signal as signal\n", 1))
-    environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    words = [sys.executable, "-S", "-m", "sim.run"]
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (130, "interrupted\n")
-
-
 @pytest.mark.parametrize(
     "code", [pytest.param(IN_EXEC, id="exec", marks=pytest.mark.slow), pytest.param(IN_C, id="compiled")]
 )

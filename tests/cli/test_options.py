@@ -241,6 +241,16 @@ def test_options_without_effect_are_refused(command, words, option, tmp_path, mo
     assert "\n" not in message
 
 
+def test_the_bridge_reads_its_file_first(tmp_path, monkeypatch):
+    """A session loads MuJoCo and measures the link, which takes seconds, so a wrong file is refused before."""
+    monkeypatch.setattr("haptic_loop.cli.bridge.session_for", None)
+    (tmp_path / "bad.json").write_text("{}")
+    bridge = import_module("haptic_loop.cli.bridge").main
+    for coupling, said in ((tmp_path / "bad.json", "is no stored coupling"), ("frob", "allowed are")):
+        with pytest.raises(InputError, match=said):
+            bridge(["--rehearse", "--coupling", str(coupling)])
+
+
 def test_two_references_are_refused(tmp_path):
     """A scenario's lam is the reference of both cases, so --reference II would change nothing."""
     assert load().replace(lam=(0, 1)).loop("I").lam == load().replace(lam=(0, 1)).loop("II").lam
