@@ -17,7 +17,7 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
@@ -441,26 +441,21 @@ def _in_slices(
 ) -> tuple[list[tuple[slice, _Part]], bool]:
     """Return (slice, task(slice)) for slices of `size` that cover range(count), and whether the keyboard interrupted.
 
-    After an interruption, only the finished slices are returned.
+    After an interruption, only slices that were finished are returned.
     """
-    finished_parts: list[tuple[slice, _Part]] = []
+    parts: list[tuple[slice, _Part]] = []
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    pool = ThreadPoolExecutor(cores)
     slices = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-    futures = {pool.submit(task, part): part for part in slices}
-    waiting, finished = set(futures), 0
-    try:
-        while waiting:
-            ready, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-            for future in ready:
-                finished_parts.append((futures[future], future.result()))
-                finished += futures[future].stop - futures[future].start
-            progress(finished, count)
+    pool = ThreadPoolExecutor(cores)
+    try:  # Ctrl-C may also come while tasks are submitted, which must not keep the program until all have run.
+        for part, values in zip(slices, pool.map(task, slices), strict=True):
+            parts.append((part, values))
+            progress(part.stop, count)
     except KeyboardInterrupt:
-        return finished_parts, True
+        return parts, True
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return finished_parts, False
+    return parts, False
 
 
 _COLUMNS = 4  # number of columns at which `map_error` compares the map's edge

@@ -6,6 +6,7 @@ Tolerances without a comment cover rounding. Eigenvalues round by up to 1e-7 1/s
 import csv
 import json
 from dataclasses import replace
+from itertools import count
 
 import msgspec
 import mujoco
@@ -599,6 +600,21 @@ def test_slices_cover_everything_once():
     assert sorted(part.start for part, _ in done) == [0, 4, 8, 12, 16, 20, 24]
     assert sum(size for _, size in done) == 25
     assert seen[-1] == (25, 25)
+
+
+def test_ctrl_c_while_tasks_are_submitted_ends_them(monkeypatch):
+    """Otherwise the program would compute the submitted slices before it ends."""
+    submit, numbers, computed = zwidth_map.ThreadPoolExecutor.submit, count(), []
+
+    def interrupted(pool, *task):
+        if next(numbers) == 3:
+            raise KeyboardInterrupt
+        return submit(pool, *task)
+
+    monkeypatch.setattr(zwidth_map.ThreadPoolExecutor, "submit", interrupted)
+    _, stopped = zwidth_map._in_slices(computed.append, 25, 1, lambda k, of: None)
+    assert stopped
+    assert len(computed) <= 3
 
 
 @pytest.mark.parametrize(
