@@ -105,7 +105,7 @@ def cause_of(text: str) -> str:
 
 
 @contextmanager
-def stopped_by(cause: str):
+def expect_stop(cause: str):
     """Expect a SafetyStop whose cause and numbers begin with the regular expression `cause`."""
     with pytest.raises(SafetyStop) as stop:
         yield

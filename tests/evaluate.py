@@ -86,6 +86,11 @@ def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
     return _lagging(rho, len(c[0]) if c else lags).required_of(G, loop(G.T, delta, theta, T_max=T_max), flat)
 
 
+def summed(demand):
+    """Return the block of a demand, which must be positive real: its free part and that of the damping."""
+    return demand.free + demand.gain
+
+
 def decisive(report):
     """Return the requirement of the condition that decides the verdict, from a command's JSON."""
     assessment = report["assessment"]

@@ -9,8 +9,9 @@ import pytest
 
 from haptic_loop.controller.coupling import ForceFilter, SpringDamper, _InternalModel
 from haptic_loop.controller.delay import delay
-from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
 
 #: Figure 4 of the paper as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, with a free mass M
 FIGURE_4 = Network(
@@ -37,6 +38,20 @@ T = 1.2e-3  # [s]
 DELTA = (1.37, 1.37)  # [N s/m]
 #: the default scenario, case I
 PAIR = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
+
+
+def pair(lam=(1, 2), network=FIGURE_4, theta=(1, 2), psi=(0, 0), delta=DELTA, period=T) -> Loop:
+    """Return a loop of two devices, by default `PAIR`."""
+    return Loop(period, theta, psi, lam, delta, network)
+
+
+def at_springs(K, B=0.0, theta=0, delta=1.37, period=T, channels=1) -> Loop:
+    """Return a loop of equal channels, each at a spring and a damper to ground."""
+    contacts, late = tuple("abcd"[:channels]), (theta,) * channels
+    springs = tuple(Spring((contact, "ground"), K, B) for contact in contacts)
+    return Loop(period, late, (0,) * channels, late, (delta,) * channels, Network(contacts, springs))
+
+
 #: a scenario of one device at a mass of 1 kg on a spring, two samples late
 ONE_MASS = """
 name = "one-mass"
@@ -85,6 +100,11 @@ VERTICES_ONLY = _InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGON
 def force_map(E, coupling, theta, psi):
     """Return F = Theta (I + Psi E V)^-1 Psi E (6) of an environment E(z)."""
     return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)
+
+
+def undelayed_map(coupling) -> Lti:
+    """Return the force map of Figure 4 with this coupling, without delays."""
+    return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
 
 
 def loop_of(network, theta, psi, period: float = T) -> Loop:

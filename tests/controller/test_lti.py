@@ -27,14 +27,14 @@ def blocks(request):
     return tuple(random_lti(rng, order, 2, 2) for order in rng.integers(0, 6, size=2))
 
 
-def close(a, b):
+def assert_close(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))
 
 
 def test_responses_equal_their_definition(blocks):
     G = blocks[0]
     expected = [G.C @ np.linalg.solve(z * np.eye(G.order) - G.A, G.B) + G.D for z in Z]
-    close(G.at(Z), expected)
+    assert_close(G.at(Z), expected)
 
 
 def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
@@ -42,7 +42,7 @@ def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
     G, other = blocks
     for H in (G, other, Lti(G.A, 2 * G.B, G.C[::-1], G.D, G.T), Lti(G.A.T, G.C.T, G.B.T, G.D.T, G.T)):
         for z in (Z, 1.5 * Z):  # sums over poles, and substitution
-            close(H.at(z), [H.C @ np.linalg.solve(one * np.eye(H.order) - H.A, H.B) + H.D for one in z])
+            assert_close(H.at(z), [H.C @ np.linalg.solve(one * np.eye(H.order) - H.A, H.B) + H.D for one in z])
         np.testing.assert_allclose(np.sort_complex(H.poles()), np.sort_complex(np.linalg.eigvals(H.A)), atol=1e-12)
 
 
@@ -52,19 +52,19 @@ def test_response_agrees_with_python_control(blocks):
 
     G = blocks[0]
     other = control.ss(G.A, G.B, G.C, G.D, G.T)
-    close(G.at(Z), np.moveaxis(other(Z), -1, 0))
+    assert_close(G.at(Z), np.moveaxis(other(Z), -1, 0))
 
 
 def test_algebra_is_pointwise(blocks):
     G, H = blocks
     g, h = G.at(Z), H.at(Z)
-    close((G @ H).at(Z), g @ h)
-    close((G + H).at(Z), g + h)
-    close((G - H).at(Z), g - h)
-    close(G.feedback(H).at(Z), np.linalg.solve(np.eye(2) + g @ h, g))
+    assert_close((G @ H).at(Z), g @ h)
+    assert_close((G + H).at(Z), g + h)
+    assert_close((G - H).at(Z), g - h)
+    assert_close(G.feedback(H).at(Z), np.linalg.solve(np.eye(2) + g @ h, g))
     both = Lti.diag(G, H).at(Z)
-    close(both[:, :2, :2], g)
-    close(both[:, 2:, 2:], h)
+    assert_close(both[:, :2, :2], g)
+    assert_close(both[:, 2:, 2:], h)
     assert not both[:, :2, 2:].any()
 
 
@@ -81,9 +81,9 @@ def test_sampled_responses_obey_the_same_algebra(m):
             (g.feedback(h), G.feedback(H)),
             (g.inverse(), G.inverse()),
         ):
-            close(sampled.G, system.at(z))
+            assert_close(sampled.G, system.at(z))
         (_, sampled), (at_one, quotient) = g.over_z_minus_one(), G.split_at_one()
-        close(sampled.G - at_one / (z - 1)[..., None, None], quotient.at(z))
+        assert_close(sampled.G - at_one / (z - 1)[..., None, None], quotient.at(z))
 
 
 def test_a_sampled_split_keeps_digits_near_one():
@@ -95,16 +95,16 @@ def test_a_sampled_split_keeps_digits_near_one():
 
 def test_the_quotient_at_one_equals_its_definition(blocks):
     G = blocks[0]
-    close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
+    assert_close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
 
 
 def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
-    """G(1) must be symmetric. In exact arithmetic, 3 + 1/z has G(1) = 4 and leaves -2 - 1/z."""
+    """Without its pole at z = 1, G/(z-1) keeps He. In Fractions, 3 + 1/z has G(1) = 4 and leaves -2 - 1/z."""
     G = blocks[0] + (blocks[0].dc().T - blocks[0].dc()) / 2
     at_one, regular = G.over_z_minus_one()
     whole, rest = G.at(Z) / (Z - 1)[:, None, None], regular.at(Z)
-    close(at_one, G.dc())
-    close(rest + np.conj(np.swapaxes(rest, -1, -2)), whole + np.conj(np.swapaxes(whole, -1, -2)))
+    assert_close(at_one, G.dc())
+    assert_close(rest + np.conj(np.swapaxes(rest, -1, -2)), whole + np.conj(np.swapaxes(whole, -1, -2)))
     at_one, regular = taps([3, 1], Fraction(1, 1000)).over_z_minus_one()
     assert (at_one.item(), regular.D.item(), regular.dc().item()) == (4, -2, -3)
 
@@ -113,7 +113,7 @@ def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
 def test_a_delay_line_equals_a_power_of_z(steps):
     D = delay(steps, 1e-3)
     assert D.order == sum(steps)
-    close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
+    assert_close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
 
 
 def test_output_delays_equal_powers_of_z(blocks):
@@ -127,7 +127,9 @@ def test_output_delays_equal_powers_of_z(blocks):
     branches = Lti(ring, np.eye(8, 1), np.arange(16.0).reshape(2, 8), np.zeros((2, 1)), T)
     for block in (loop, loop.split_at_one()[1], delay((2, 3), T) @ G.feedback(0.01 * loop), branches):
         z = 1.1 * Z[:, None, None]
-        close(block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D)
+        assert_close(
+            block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D
+        )
         assert block.poles().size == block.order
     assert loop._lines[0].size == G.order + 5 + 1  # of the output's 3 delays, 2 only copy the first
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from evaluate import any_environment, this_environment
-from shared import DELTA, FIGURE_4, T, force_map
+from shared import DELTA, T, force_map, pair
 
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper
@@ -21,10 +21,6 @@ from haptic_loop.design.fixed_order import _START_ROOM, _descend, _FixedOrder
 from haptic_loop.design.lmi import RESERVE, Shaping
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
-
-
-def pair(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA) -> Loop:
-    return Loop(T, (1, 2), psi, lam, delta, network)
 
 
 HELD = Network(("tip",), (Spring(("tip", "mass"), 800.0, 1.0), Spring(("mass", GROUND), 100.0, 1.0)), {"mass": 0.5})

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluate import prove_limiter, this_environment
-from shared import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
+from shared import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF, at_springs
 
 from haptic_loop.controller import coupling as controller_coupling
 from haptic_loop.controller.arithmetic import SingularLoop, numbers, rational, solve
@@ -39,12 +39,6 @@ from tests.checks.random_loops import proofs
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 change = msgspec.structs.replace
-
-
-def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loop:
-    """Return the loop of one device that a spring and a damper join to the ground, without delay."""
-    network = Network(contacts=("tip",), springs=(Spring(("tip", "ground"), stiffness, damping),))
-    return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
 def test_channels_without_cross_terms_need_their_own_damping():
@@ -134,9 +128,9 @@ def test_loops_without_coupling_are_proved_with_enough_damping():
 @pytest.mark.parametrize(("K", "B"), [(1000.0, 0.0), (500.0, 0.3), (30.0, 2.0)])
 def test_proofs_reach_colgates_condition_within_a_millionth(K, B):
     needed = K * 1e-3 / 2 + B
-    assert verify(certified(wall(K, B, needed * (1 + 1e-6)), NoCoupling(), "this-environment")).proved
+    assert verify(certified(at_springs(K, B, 0, needed * (1 + 1e-6), 1e-3), NoCoupling(), "this-environment")).proved
     with pytest.raises(NotProved, match="needs"):
-        prove(wall(K, B, needed * (1 - 1e-6)), NoCoupling(), "this-environment")
+        prove(at_springs(K, B, 0, needed * (1 - 1e-6), 1e-3), NoCoupling(), "this-environment")
 
 
 def test_three_unequal_channels_are_proved():
@@ -309,7 +303,7 @@ def cancelling(size: float) -> Compliance:
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 def test_realisations_changed_by_rounding_are_refused(condition):
     """The modes cancel in exact arithmetic, but rounding in floating point leaves a part of them."""
-    loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
+    loop = at_springs(1000.0, 0.0, 1, 5.0, 1e-3)
     assert verify(certified(loop, cancelling(1.0), condition)).proved
     with pytest.raises(NotProved, match=r"rounding may change the forces by 1\.\de-04 \(relative\)"):
         prove(loop, cancelling(1000.0), condition)
@@ -325,7 +319,7 @@ def test_second_processes_refuse_rounding(least, monkeypatch):
     """A large proof and the check of rounding are computed at the same time, with the same verdicts."""
     monkeypatch.setattr("haptic_loop.design.forked.allowed", True)
     monkeypatch.setattr("haptic_loop.design.certificate._FORKED", least)
-    loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
+    loop = at_springs(1000.0, 0.0, 1, 5.0, 1e-3)
     assert verify(certified(loop, cancelling(1.0), "this-environment")).proved
     with pytest.raises(NotProved, match="rounding may change the forces by"):
         prove(loop, cancelling(1000.0), "this-environment")
@@ -336,7 +330,7 @@ def test_the_bound_on_rounding_holds_over_ticks():
 
     The entries of x have a standard deviation of 1, so the norm of its 200 entries is below 3 sqrt(200).
     """
-    loop, rng = change(wall(1000.0, 2.0, 5.0), theta=(1,), lam=(1,)), np.random.default_rng(8)
+    loop, rng = at_springs(1000.0, 2.0, 1, 5.0, 1e-3), np.random.default_rng(8)
     for size in (1.0, 1e3):
         running, exact = loop.F(cancelling(size)), loop.F(cancelling(size), exact=True)
         x = np.round(rng.normal(size=200), 3)

@@ -5,11 +5,11 @@ import re
 
 import numpy as np
 import pytest
-from shared import FIGURE_4, PAIR, SOFT
+from shared import FIGURE_4, PAIR, SOFT, at_springs
 
 from haptic_loop.cli.compare import main
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
-from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.compare import curves, grid, ideal, judge
 from haptic_loop.design.result import DesignFailed
@@ -37,12 +37,6 @@ def by_hand(hz):
         yield E, theta @ np.linalg.inv(np.eye(2) + E @ V) @ E, theta
 
 
-def wall(K, B=0.0, theta=0):
-    """Return a loop of one device whose environment is a grounded spring-damper."""
-    network = Network(("tip",), (Spring(("tip", GROUND), K, B),))
-    return Loop(T, (theta,), (0,), (theta,), (DELTA,), network)
-
-
 def test_singular_values_and_impedances_match_the_formulas():
     lines = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ)
     sigma_E, undelayed = ideal(PAIR, HZ)
@@ -59,7 +53,7 @@ def test_singular_values_and_impedances_match_the_formulas():
 
 
 def test_an_undelayed_wall_feels_like_its_spring():
-    felt = curves(wall(1000.0), judge(wall(1000.0), NoCoupling()), HZ).perceived
+    felt = curves(at_springs(1000.0), judge(at_springs(1000.0), NoCoupling()), HZ).perceived
     np.testing.assert_allclose(felt.stiffness[:, 0], 1000.0, rtol=1e-12)
     np.testing.assert_allclose(felt.damping[:, 0], 0.0, rtol=0, atol=1e-12)
 
@@ -70,11 +64,11 @@ def test_delayed_springs_and_dampers_have_closed_forms():
     A damper B in backward Euler has the stiffness B (1 - cos wT)/T and the damping B sin(wT)/(wT).
     """
     omega = 2 * np.pi * HZ
-    late = wall(1000.0, theta=1)
+    late = at_springs(1000.0, theta=1)
     felt = curves(late, judge(late, NoCoupling()), HZ).perceived
     np.testing.assert_allclose(felt.stiffness[:, 0], 1000 * np.cos(omega * T), rtol=1e-9)
     np.testing.assert_allclose(felt.damping[:, 0], -1000 * np.sin(omega * T) / omega, rtol=1e-9)
-    damped = wall(1000.0, 2.0)
+    damped = at_springs(1000.0, 2.0)
     felt = curves(damped, judge(damped, NoCoupling()), HZ).perceived
     np.testing.assert_allclose(felt.stiffness[:, 0], 1000 + 2 * (1 - np.cos(omega * T)) / T, rtol=1e-9)
     np.testing.assert_allclose(felt.damping[:, 0], 2 * np.sin(omega * T) / (omega * T), rtol=1e-9)
@@ -123,7 +117,7 @@ def test_curves_of_delayed_environments_reach_the_ratio():
 
 def test_perceived_damping_with_hold_gives_the_requirement():
     """For one channel, the minimum of T Im[F e^(-jw/2)]/(2 sin(w/2)) over frequency is -required."""
-    loop = wall(900.0, 0.4, theta=2)
+    loop = at_springs(900.0, 0.4, theta=2)
     judged = judge(loop, SpringDamper([2000.0], [0.3]))
     w = np.linspace(1e-4, np.pi, 200_001)
     late = (judged.F.at(np.exp(1j * w))[:, 0, 0] * np.exp(-0.5j * w)).imag * T / (2 * np.sin(w / 2))

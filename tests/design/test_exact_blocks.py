@@ -16,6 +16,7 @@ import pytest
 from evaluate import (
     any_environment_demand,
     limiter_demand,
+    summed,
     switching_demand,
     this_environment_demand,
     walls_demand,
@@ -100,29 +101,25 @@ def to_ground(*stiffness: float, damping: float = 0.0) -> Network:
     return Network(tuple(f"tip {i}" for i in range(len(stiffness))), springs)
 
 
-def both(demand):
-    return demand.free + demand.gain
-
-
 # this-environment
 
 
 def test_the_exact_block_holds_the_damping_exactly():
     F, delta = Lti.constant([[1000]], rational(T)), Fraction(1, 3)
-    assert both(this_environment_demand(F, [delta])).D[0, 0] == delta / rational(T) - 500
+    assert summed(this_environment_demand(F, [delta])).D[0, 0] == delta / rational(T) - 500
 
 
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_springs_need_the_closed_form(theta):
     """The limit is (theta + 1/2) K T."""
     F = loop_of(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda d: both(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
+    assert_limit(lambda d: summed(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
 
 
 def test_undelayed_spring_dampers_need_the_closed_form():
     """The limit is K T/2 + B."""
     F = loop_of(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda d: both(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
+    assert_limit(lambda d: summed(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
 
 
 def test_joined_channels_need_the_largest_eigenvalue():
@@ -131,7 +128,7 @@ def test_joined_channels_need_the_largest_eigenvalue():
     springs = (Spring(("a", "b"), 300.0), Spring(("a", "ground"), 600.0), Spring(("b", "ground"), 100.0))
     F = loop_of(Network(("a", "b"), springs), (2, 2)).F(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
     top = np.linalg.eigvalsh(K / np.sqrt(ratio[:, None] * ratio)).max()
-    assert_limit(lambda d: both(this_environment_demand(F, [d, 0.37 * d])), 2.5 * T * top)
+    assert_limit(lambda d: summed(this_environment_demand(F, [d, 0.37 * d])), 2.5 * T * top)
 
 
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 1), (1, 0))])
@@ -142,7 +139,7 @@ def test_figure_4_needs_what_a_sweep_finds(theta, psi):
         return np.linalg.eigvalsh(-T * he(F / (z - 1)[:, None, None])).max(axis=1)
 
     F = loop_of(FIGURE_4, theta, psi).F(STIFF, exact=True)
-    assert_limit(lambda d: both(this_environment_demand(F, [d, d])), highest(needed))
+    assert_limit(lambda d: summed(this_environment_demand(F, [d, d])), highest(needed))
 
 
 # any-environment, psi = 0
@@ -171,7 +168,7 @@ def test_one_spring_damper_meets_its_any_environment_limit(theta, gains):
         assert limit == pytest.approx(K * T * (theta + 1) ** 2 / 2, rel=1e-7)
     if not theta:
         assert limit == pytest.approx(K * T / 2 + B)
-    assert_limit(lambda d: both(any_environment_demand(V, (theta,), [d])), limit)
+    assert_limit(lambda d: summed(any_environment_demand(V, (theta,), [d])), limit)
 
 
 def test_rotated_spring_dampers_need_the_larger_limit():
@@ -179,7 +176,7 @@ def test_rotated_spring_dampers_need_the_larger_limit():
     turn = np.array([[Fraction(3, 5), Fraction(-4, 5)], [Fraction(4, 5), Fraction(3, 5)]])
     V = turn @ SpringDamper([900.0, 700.0], [0.4, 0.3]).compliance(rational(T)) @ turn.T
     limit = max(any_environment_limit(900.0, 0.4, 1), any_environment_limit(700.0, 0.3, 1))
-    assert_limit(lambda d: both(any_environment_demand(V, (1, 1), [d, d])), limit)
+    assert_limit(lambda d: summed(any_environment_demand(V, (1, 1), [d, d])), limit)
 
 
 # any-environment, psi >= 1
@@ -250,7 +247,7 @@ def test_switching_before_a_spring_needs_the_closed_form(weight, ages):
     limit = T * (alpha / 2 + (h * K) ** 2 / (2 * alpha) + K * ((lo + hi) / 2 + 0.5))
     if weight == 1:
         assert limit == pytest.approx((hi + 0.5) * K * T)
-    assert_limit(lambda d: both(switching_demand(G, [lo], [hi], [d], [alpha])), limit)
+    assert_limit(lambda d: summed(switching_demand(G, [lo], [hi], [d], [alpha])), limit)
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
@@ -267,7 +264,7 @@ def test_switching_needs_what_a_dense_sweep_finds(lo, hi):
         return np.linalg.eigvalsh(T * (np.diag(alpha / 2) + cost - he(nominal))).max(axis=1)
 
     G = loop_of(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
-    assert_limit(lambda d: both(switching_demand(G, lo, hi, [d, d], alpha.tolist())), highest(needed))
+    assert_limit(lambda d: summed(switching_demand(G, lo, hi, [d, d], alpha.tolist())), highest(needed))
 
 
 # periods, latency, limits and walls
@@ -278,11 +275,11 @@ def test_the_longest_period_scales_each_block(longest):
     """A longest period T_max needs T_max/T times the damping for the constant period T."""
     rigid = Compliance(Lti.constant([[0.0]], T))
     F, V = loop_of(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
-    assert_limit(lambda d: both(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
+    assert_limit(lambda d: summed(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
     needs = any_environment_limit(900.0, 0.4, 1) * longest / T
-    assert_limit(lambda d: both(any_environment_demand(V, (1,), [d], longest)), needs)
+    assert_limit(lambda d: summed(any_environment_demand(V, (1,), [d], longest)), needs)
     G = loop_of(to_ground(1000.0), (0,)).sent(rigid, exact=True)
-    assert_limit(lambda d: both(switching_demand(G, [1], [3], [d], [1000.0], longest)), 3.5 * 1000 * longest)
+    assert_limit(lambda d: summed(switching_demand(G, [1], [3], [d], [1000.0], longest)), 3.5 * 1000 * longest)
 
 
 @pytest.mark.parametrize(("first", "last", "longest"), [(1.3e-4, 1.3e-4, T), (0.0, 5e-4, T), (2e-4, 6e-4, 1.5e-3)])
@@ -291,7 +288,7 @@ def test_a_spring_with_latency_needs_the_closed_form(first, last, longest):
     K, a, b = 1000.0, 1 / last, 1 / (longest - first)
     limit = max(np.roots([a * b, -K * (a + 3 * b) / 2, -(K**2) / 4]))
     F = loop_of(to_ground(K), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda d: both(this_environment_demand(F, [d], longest, [(first, last)])), limit)
+    assert_limit(lambda d: summed(this_environment_demand(F, [d], longest, [(first, last)])), limit)
 
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
@@ -308,7 +305,7 @@ def test_a_limited_spring_needs_the_computed_damping(theta, c):
         return T * (np.abs(a - b) ** 2 / both_ways - a)
 
     G = loop_of(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda d: both(limiter_demand(G, [theta], [d], [rho], [[c]])), highest(needed))
+    assert_limit(lambda d: summed(limiter_demand(G, [theta], [d], [rho], [[c]])), highest(needed))
 
 
 @pytest.mark.parametrize(("theta", "g"), [(0, 1.0), (1, 2.0), (2, 0.7)])
@@ -318,7 +315,7 @@ def test_walls_at_the_device_need_the_closed_form(theta, g):
     network = Network(("tip",), (), walls=(wall,))
     G = loop_of(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
     limit = (theta + 1 + g) ** 2 * 3000.0 * T / (4 * g + 2)
-    assert_limit(lambda d: both(walls_demand(G, [d], [3000.0], [g * 3000.0])), limit)
+    assert_limit(lambda d: summed(walls_demand(G, [d], [3000.0], [g * 3000.0])), limit)
 
 
 # `prove` and `verify` with a sweep that certifies every loop

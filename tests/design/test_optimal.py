@@ -13,6 +13,7 @@ import pytest
 import scipy
 from evaluate import this_environment
 from scipy.optimize import minimize_scalar
+from shared import at_springs
 
 from haptic_loop.cli.compare import main as compare_main
 from haptic_loop.cli.design import main
@@ -71,14 +72,6 @@ def short_bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int |
     if key not in _bounds:
         _bounds[key] = bound(loop, band_hz, 8)
     return _bounds[key]
-
-
-def wall(K: float, theta: int, delta: float, T: float = 1e-3, channels: int = 1) -> Loop:
-    """Return a loop of equal channels, each before a spring to ground."""
-    contacts = tuple("abcd"[:channels])
-    network = Network(contacts=contacts, springs=tuple(Spring((c, "ground"), K, 0.0) for c in contacts))
-    late = (theta,) * channels
-    return Loop(T, late, (0,) * channels, late, (delta,) * channels, network)
 
 
 def force(loop: Loop, coupling) -> Lti:
@@ -182,7 +175,7 @@ def test_causal_parts_match_the_transform():
 @pytest.mark.parametrize("channels", [2, *(pytest.param(n, marks=pytest.mark.validate) for n in (3, 4))])
 def test_parallel_walls_have_one_walls_bound(channels):
     """Parallel walls are separate problems, so their bound is that of one wall."""
-    one, several = (bound(wall(3000.0, 3, 1.0, channels=n), knots=4) for n in (1, channels))
+    one, several = (bound(at_springs(3000.0, 0.0, 3, 1.0, 1e-3, n), knots=4) for n in (1, channels))
     assert several.rms == pytest.approx(one.rms, rel=0.02)
     assert several.rms > 0.1
 
@@ -343,7 +336,7 @@ def test_designs_keep_small_forces_accurate():
 @pytest.mark.parametrize("theta", [0, 1, 16])
 def test_scaled_walls_need_the_closed_form(theta):
     """The wall g K needs the damping g K (theta + 1/2) T, and half the filter needs half the damping."""
-    loop = wall(3000.0, theta, 1.3)
+    loop = at_springs(3000.0, 0.0, theta, 1.3, 1e-3)
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
         assert ratio_in(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
@@ -361,7 +354,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     It is the mass at z = 1 of a measure with total delta whose moments 1 .. theta are zero. A plain spring reaches
     delta/(2 theta + 1); a designed filter reaches more.
     """
-    loop = wall(5000.0, theta, 1.0)
+    loop = at_springs(5000.0, 0.0, theta, 1.0, 1e-3)
     optimum = design(loop, Options(bases=((4, 3), (8, 6), (14, 10))))
     stiffness = optimum.g * 5000 * loop.T / 2
     assert 1.05 / (2 * theta + 1) < stiffness < 1 / (theta + 1)
@@ -822,7 +815,7 @@ def test_late_walls_match_their_closed_form():
     """The K with (delta/t2 - 3K/2)(delta/T - K/2) = K^2 needs all of delta; a design reaches 0.98 K."""
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # with any latency in [0, t2] this wall needs all of delta
-    loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
+    loop = msgspec.structs.replace(at_springs(2 * K, 0.0, 0, delta, T), latency=((0.0, t2),))
     assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
     optimum = design(loop, SMALLEST)
     assert optimum.proved

@@ -11,7 +11,7 @@ import scipy
 from analysis import analysis, solve
 from evaluate import any_environment, this_environment
 from scipy.optimize import brentq, minimize, rosen, rosen_der
-from shared import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
+from shared import DELTA, SOFT_NETWORK, T, force_map, pair
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
@@ -31,10 +31,6 @@ from haptic_loop.sim.scenario import load
 
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))
-
-
-def pair(lam=(1, 2), network=FIGURE_4, theta=(1, 2), psi=(0, 0), delta=DELTA, period=T) -> Loop:
-    return Loop(period, theta, psi, lam, delta, network)
 
 
 def random_starts(count, seed=0):

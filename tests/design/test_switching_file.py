@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluate import switching_demand, switching_sweep, this_environment
-from shared import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, environment_by_hand, force_map
+from shared import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, environment_by_hand, force_map, undelayed_map
 
 from haptic_loop import certify
 from haptic_loop.cli.audit import main as audit_main
@@ -62,10 +62,6 @@ def constant_file(tmp_path) -> str:
     return str(tmp_path / "constant.json")
 
 
-def sent(coupling: SpringDamper):
-    return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
-
-
 # the proof
 
 
@@ -75,7 +71,7 @@ def test_a_stored_proof_is_verified_after_loading(stored, file):
     assert verify(read).proved
     proof = read.certificate
     assert (proof.condition, proof.facts) == ("this-environment", ("switching",))
-    assert proof.required == pytest.approx(switching_sweep(sent(SOFT), *[(1, 1), (2, 2)], DELTA).required)
+    assert proof.required == pytest.approx(switching_sweep(undelayed_map(SOFT), *[(1, 1), (2, 2)], DELTA).required)
     assert 1.07 < proof.required[0] < 1.08
     assert proof.margin == pytest.approx(1.37 / proof.required[0])
 
@@ -84,7 +80,9 @@ def test_stored_multipliers_pass_a_dense_sweep(stored):
     """The stored alpha and P satisfy the condition at 20000 frequencies and the KYP inequality in floating point."""
     proof = stored.certificate
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    demand = switching_demand(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.multipliers["alpha"])
+    demand = switching_demand(
+        Sampled.of(undelayed_map(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.multipliers["alpha"]
+    )
     assert np.linalg.eigvalsh(hermitian(demand.free.G + demand.gain.G)).min() > 0
     G = exact_block(LOOP, SOFT, proof.multipliers["alpha"])
     F, S = G.floats(), Matrix.of(proof.matrices["P"]).floats()
@@ -106,7 +104,7 @@ def test_other_ranges_are_proved_too(lo, hi):
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
 def test_constant_delays_in_range_need_no_more(coupling):
     """Constant delays need no more damping than switching, so a file that is proved for switching covers them."""
-    switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).ratio
+    switching = switching_sweep(undelayed_map(coupling), (1, 0), (2, 3), DELTA).ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
         F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
         assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
@@ -175,7 +173,7 @@ def test_facts_must_match_the_range_of_delays(stored):
 def test_negative_multipliers_are_refused():
     """A channel of constant delay has no second row with alpha, so a negative alpha would add damping for free."""
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
-    requirement = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
+    requirement = switching_sweep(undelayed_map(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
         exact_block(loop, STIFF, (requirement.multiplier[0], -1e6))
 

@@ -6,8 +6,8 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-from evaluate import switching_demand, switching_sweep, this_environment
-from shared import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
+from evaluate import summed, switching_demand, switching_sweep, this_environment
+from shared import DELTA, FIGURE_4, SOFT, STIFF, T, force_map, undelayed_map
 
 from haptic_loop.cli.audit import main
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -24,22 +24,14 @@ from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import InputError
 
 
-def sent(coupling=STIFF, T=T) -> Lti:
-    return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
-
-
 def loop_of(lo, hi, delta=DELTA, network=FIGURE_4) -> Loop:
     return Loop(T, lo, (0,) * len(lo), lo, delta, network, varying_delay=DelayRange(lo, hi))
-
-
-def both(demand):
-    return demand.free + demand.gain
 
 
 def condition(z, G, alpha, lo, hi, damping, T=T):
     """Return the condition's matrix, which must be positive, at each z (k,); a delay that varies has a second row."""
     demand = switching_demand(Sampled(z[None], G[None], T), lo, hi, damping, alpha)
-    return hermitian(both(demand).G[0])
+    return hermitian(summed(demand).G[0])
 
 
 def block(z, G, alpha, lo, hi, damping):
@@ -67,7 +59,7 @@ def test_springs_need_the_damping_of_their_longest_delay(lo, hi):
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
 def test_one_delay_gives_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
-    requirement = switching_sweep(sent(), theta, theta, DELTA)
+    requirement = switching_sweep(undelayed_map(STIFF), theta, theta, DELTA)
     assert requirement.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
     assert requirement.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
@@ -75,7 +67,7 @@ def test_one_delay_gives_the_this_environment_condition(theta):
 def test_the_least_factor_matches_a_convex_solver():
     """An SDP in (s, alpha) at 13 frequencies, which shares no code with the sweep, has the same least factor."""
     lo, hi = (0, 1), (3, 2)
-    G, delta = sent(), np.array([1.37, 0.9])
+    G, delta = undelayed_map(STIFF), np.array([1.37, 0.9])
     requirement = switching_sweep(G, lo, hi, delta)
     per_hz = 2 * np.pi * T
     near = requirement.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
@@ -101,7 +93,7 @@ def test_the_least_factor_matches_a_convex_solver():
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_gives_the_same_requirement(lo, hi):
     """At 20000 frequencies the condition holds 1e-5 above the requirement, and fails 0.1 % below it."""
-    G, requirement = sent(), switching_sweep(sent(), lo, hi, DELTA)
+    G, requirement = undelayed_map(STIFF), switching_sweep(undelayed_map(STIFF), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     alpha, needed, response = np.array(requirement.multiplier), np.array(requirement.required), G.at(z)
 
@@ -115,7 +107,7 @@ def test_a_dense_sweep_gives_the_same_requirement(lo, hi):
 
 def test_the_energy_bound_holds_for_worst_ages():
     """Over time sum f'dx + sum dx'(Delta/T)dx > 0 from rest, with the worst age at every tick."""
-    G, lo, hi = sent(), 1, 3
+    G, lo, hi = undelayed_map(STIFF), 1, 3
     needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).required)
     rng, ticks = np.random.default_rng(0), 3000
     w = 2 * np.pi * T * switching_sweep(G, (lo, lo), (hi, hi), DELTA).frequency_hz
@@ -141,7 +133,7 @@ def test_the_energy_bound_holds_for_worst_ages():
 
 
 def test_unsafe_or_malformed_switching_is_refused():
-    floating = switching_sweep(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
+    floating = switching_sweep(undelayed_map(NoCoupling()), (1, 1), (2, 2), DELTA)
     assert (
         floating.ratio
         > this_environment(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
@@ -151,9 +143,9 @@ def test_unsafe_or_malformed_switching_is_refused():
     assert not requirement.certified
     assert "pole" in requirement.reason
     with pytest.raises(ValueError, match="lo <= hi"):
-        switching_sweep(sent(), (2, 2), (1, 1), DELTA)
+        switching_sweep(undelayed_map(STIFF), (2, 2), (1, 1), DELTA)
     with pytest.raises(ValueError, match="has 1 entries"):
-        switching_sweep(sent(), (1,), (2,), DELTA)
+        switching_sweep(undelayed_map(STIFF), (1,), (2,), DELTA)
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
@@ -176,7 +168,7 @@ def test_uncertified_switching_has_no_exact_proof():
         prove(loop, STIFF, "this-environment")
 
     def storage(loop: Loop):
-        return find_storage(both(SWITCHING.exact_demands(loop, STIFF, requirement.multiplier)["P"]))
+        return find_storage(summed(SWITCHING.exact_demands(loop, STIFF, requirement.multiplier)["P"]))
 
     assert "violated" in storage(loop)[1]
     required = np.array(requirement.required)

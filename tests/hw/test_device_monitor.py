@@ -5,7 +5,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from causes import cause_of, stopped_by
+from causes import cause_of, expect_stop
 from shared import FakePort, checkered
 
 from haptic_loop.design.files import plain
@@ -89,7 +89,7 @@ def test_unrequested_forces_are_faults(phase, force):
     told.unlike(state(0), 1)
     for tick in range(1, _PATIENCE):
         assert told.unlike(state(tick, (force[0] * tick, force[1]), phase), 1)
-    with stopped_by("force unlike the command: .* 5$|long hold: 5 4$"):
+    with expect_stop("force unlike the command: .* 5$|long hold: 5 4$"):
         told.unlike(state(_PATIENCE, (force[0] * _PATIENCE, force[1]), phase), 1)
 
 
@@ -100,12 +100,12 @@ def test_intermittent_wrong_devices_are_found_later():
         told.tell(tick - CONFIG.theta, (0, 0))
         assert told.unlike(state(tick, (300 * (tick % 2), 0)), 1) == bool(tick % 2)
     told.tell(9 - CONFIG.theta, (0, 0))
-    with stopped_by("force unlike the command:"):
+    with expect_stop("force unlike the command:"):
         told.unlike(state(9, (300, 0)), 1)
 
 
 def test_a_disarmed_device_has_no_force():
-    with stopped_by("force without arming: 1 0$"):
+    with expect_stop("force without arming: 1 0$"):
         _check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
     _check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
 
@@ -308,16 +308,16 @@ def run_clock(ticks):
 
 @pytest.mark.parametrize(("factor", "found"), [(1.005, False), (0.995, False), (1.012, True), (0.988, True)])
 def test_a_clock_off_by_a_percent_is_found(factor, found):
-    with stopped_by("device clock:") if found else nullcontext():
+    with expect_stop("device clock:") if found else nullcontext():
         run_clock([factor * T_US] * 3 * _BLOCK)
 
 
 def test_one_freeze_is_no_drift_but_two_are():
     once = [T_US + 4000 * (n == 50) for n in range(_BLOCK)]
     run_clock(once)
-    with stopped_by("device clock:"):
+    with expect_stop("device clock:"):
         run_clock([T_US + 4000 * (n in (50, 60)) for n in range(_BLOCK)])
-    with stopped_by("device clock:"):
+    with expect_stop("device clock:"):
         run_clock([T_US, -5000, T_US])  # the clock goes back
 
 
@@ -325,7 +325,7 @@ def test_gaps_within_the_watchdog_are_allowed():
     clock = ClockMonitor(SafetyLimits((12.0,)).watchdog_us, 1e-6 * T_US)
     for n in (0, 5, 6, 11, 12):
         clock.check(state(n, t_us=n * T_US), 5 if n in (5, 11) else 1, n * T_US)
-    with stopped_by("tick leap: 6 "):
+    with expect_stop("tick leap: 6 "):
         clock.check(state(18, t_us=18 * T_US), 6, 18 * T_US)
 
 
@@ -347,7 +347,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
     ages = Ages(tuple(range(100, 190)), missing=10)
     assert ages.quantile(0.5) == 150
     assert ages.quantile(0.89) == 189
-    with stopped_by("answers that never arrived: 10 95$"):
+    with expect_stop("answers that never arrived: 10 95$"):
         ages.quantile(0.95)
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from causes import cause_of, stopped_by
+from causes import cause_of, expect_stop
 from scipy.linalg import expm
 
 from haptic_loop import load
@@ -86,7 +86,7 @@ def test_coupled_motors_are_found_at_arming():
 
 
 def test_a_link_slower_than_a_period_is_refused():
-    with stopped_by("answers beyond a tick: 1250 1200"):
+    with expect_stop("answers beyond a tick: 1250 1200"):
         timed(LAB, Ages((1150,) * 100), 0.99, 100.0, at_once=True)
 
 

@@ -23,7 +23,7 @@ from haptic_loop.hw.monitor import CommandMonitor
 from haptic_loop.hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
 from haptic_loop.hw.session import _check_state
 from haptic_loop.sim.scenario import load
-from tests.causes import stopped_by
+from tests.causes import expect_stop
 
 LIMITS = SafetyLimits((12.0, 6.0))
 T = 1.2e-3
@@ -38,7 +38,7 @@ def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
         max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
     )
     if not all(map(math.isfinite, asked)):
-        with stopped_by("no force:"):
+        with expect_stop("no force:"):
             LIMITS.shape(asked, before, gain, T)
         return
     shaped = LIMITS.shape(asked, before, gain, T)
@@ -78,7 +78,7 @@ def test_a_vector_keeps_its_direction_at_its_cap():
 
 def test_forces_of_nan_are_refused_before_clipping():
     assert max(-12.0, min(12.0, math.nan)) == 12.0
-    with stopped_by("no force: nan 0$"):
+    with expect_stop("no force: nan 0$"):
         LIMITS.shape((math.nan, 0.0), (0.0, 0.0), 0.0, T)
 
 
@@ -140,7 +140,7 @@ def test_caps_above_twelve_newtons_are_refused():
 @pytest.mark.parametrize(("moved", "ticks", "fault"), [(2.9e-3, 1, False), (3.1e-3, 1, True), (5.9e-3, 2, False)])
 def test_jumps_are_measured_per_tick(moved, ticks, fault):
     if fault:
-        with stopped_by(r"jump: 2 3\.1 3 1$"):
+        with expect_stop(r"jump: 2 3\.1 3 1$"):
             LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
     else:
         LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
@@ -286,9 +286,9 @@ def test_counting_errors_are_no_motion():
         ((0, 0, jump, jump), (3, 1, 2)),
     ):
         for sign in (1, -1):
-            with stopped_by(r"jolt: 1 \S+ 1$" if gaps[1] == 1 else r"jolt: 1 \S+ 1 2$"):
+            with expect_stop(r"jolt: 1 \S+ 1$" if gaps[1] == 1 else r"jolt: 1 \S+ 1 2$"):
                 LIMITS.check_jolt([(sign * x,) for x in path], gaps, most)
-    with stopped_by(r"jolt: 2 1\.1 "):
+    with expect_stop(r"jolt: 2 1\.1 "):
         LIMITS.check_jolt([(0.0, x) for x in (0, 0, jump, jump)], (1, 1, 1), most * 2)
 
 
@@ -334,7 +334,7 @@ def test_motion_checks_cover_channels_and_signs(channel, sign):
         (f"speed: {channel + 1} ", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
     ):
         check(on(channel, sign * inside))
-        with stopped_by(cause):
+        with expect_stop(cause):
             check(on(channel, sign * outside))
 
 
@@ -358,9 +358,9 @@ def test_cap_and_slew_cover_channels_and_signs(channel, sign):
 @pytest.mark.parametrize("channel", [0, 1])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_invalid_forces_are_found_on_both_channels(channel, value):
-    with stopped_by("no force:"):
+    with expect_stop("no force:"):
         LIMITS.shape(on(channel, value), (0.0, 0.0), 0.0, T)
-    with stopped_by("no force:"):
+    with expect_stop("no force:"):
         LIMITS.shape((0.0, 0.0), (0.0, 0.0), 0.0, T, on(channel, math.nan))
 
 
@@ -381,7 +381,7 @@ def test_motor_heat_grows_with_squared_force(channel, sign):
             heat.check(on(channel, sign * 4.0), 1)
             ticks += 1
 
-    with stopped_by(f"heat: {channel + 1} 2 2$"):
+    with expect_stop(f"heat: {channel + 1} 2 2$"):
         push(Heat(limits, T))
     assert ticks * T == pytest.approx(5.0 * math.log(4 / 3), abs=2 * T)
     at_once = Heat(limits, T)
@@ -401,9 +401,9 @@ def test_device_reports_are_checked_on_all_channels(channel, sign):
 
     cap = config.cap[channel]
     _check_state(said(0, cap), config, Stage.ARMED, 1.0)
-    with stopped_by("force above the cap:"):
+    with expect_stop("force above the cap:"):
         _check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
-    with stopped_by("force without arming:"):
+    with expect_stop("force without arming:"):
         _check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
     for told, applied, wrong in ((500, 500, False), (500, 501, False), (500, 502, True), (500, 498, True)):
         monitor = CommandMonitor(config)

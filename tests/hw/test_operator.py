@@ -11,13 +11,7 @@ from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from tests.causes import cause_of
-from tests.sessions import MovesAxes
-
-
-def rehearsal_of(scenario, link_couplings, operator, *faults):
-    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100))
-    faults = tuple(map(FaultInjection.parse, faults))
-    return Rehearsal(session, Emulator(scenario, faults), lambda ages: link_couplings, faults, operator=operator)
+from tests.sessions import MovesAxes, rehearsal_of
 
 
 def stages(session):
@@ -28,7 +22,7 @@ def stages(session):
 @pytest.mark.parametrize("start", [0.2496, 0.5])
 def test_a_session_arms_by_itself_once(scenario, link_couplings, start):
     """Late answers, in ramp-in or after it, end a session if nobody arms the softer coupling."""
-    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
+    rehearsal = rehearsal_of(scenario, link_couplings, f"down:jitter=0.0008@{start}", operator=Operator(True, 5.0))
     session = rehearsal.run_until_armed(2.0)
     assert session.stage == Stage.REFUSED
     assert cause_of(session.cause).startswith("nobody to arm:")
@@ -40,7 +34,7 @@ def test_a_key_during_a_hindrance_arms_nothing(scenario, link_couplings, monkeyp
     held = [False]
     monkeypatch.setattr(Session, "held", property(lambda session: held[0]))
     operator = Operator(True, 5.0)
-    rehearsal = rehearsal_of(scenario, link_couplings, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=operator)
     session = rehearsal.run(0.3)
     operator.press("a", session, session.now)
     assert session.stage == Stage.DISARMED
@@ -50,7 +44,8 @@ def test_a_key_during_a_hindrance_arms_nothing(scenario, link_couplings, monkeyp
 
 def test_sessions_with_late_answers_never_reach_full_gain(scenario, link_couplings):
     """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
-    session = rehearsal_of(scenario, link_couplings, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
+    rehearsal = rehearsal_of(scenario, link_couplings, "down:jitter=0.0008@0", operator=Operator(True, 5.0))
+    session = rehearsal.run_until_armed(2.0)
     assert Stage.DISARMING in stages(session)
     assert Stage.ARMED not in stages(session)
     assert session.stage == Stage.REFUSED
@@ -59,7 +54,7 @@ def test_sessions_with_late_answers_never_reach_full_gain(scenario, link_couplin
 
 def test_sessions_end_after_their_time_at_full_gain(scenario, link_couplings):
     operator = Operator(True, 0.3)
-    rehearsal = rehearsal_of(scenario, link_couplings, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=operator)
     session = rehearsal.run_until_armed(0.6)
     assert session.stage == Stage.ARMED
     assert operator.press("a", session, session.now) == ()
@@ -72,7 +67,7 @@ def test_sessions_end_after_their_time_at_full_gain(scenario, link_couplings):
 def test_a_key_arms_a_disarmed_session_only(scenario, link_couplings):
     """A key pressed in a ramp-out must not arm the next coupling."""
     operator = Operator(False, 5.0)
-    rehearsal = rehearsal_of(scenario, link_couplings, operator, "down:jitter=0.0008@0.5")
+    rehearsal = rehearsal_of(scenario, link_couplings, "down:jitter=0.0008@0.5", operator=operator)
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == ()
@@ -90,7 +85,7 @@ def test_a_key_arms_a_disarmed_session_only(scenario, link_couplings):
 
 
 def test_other_keys_do_nothing(scenario, link_couplings):
-    rehearsal = rehearsal_of(scenario, link_couplings, Operator(False, 1.0))
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=Operator(False, 1.0))
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     for key in ("x", "\n", "A"):
@@ -134,7 +129,7 @@ def test_axes_moved_as_asked_arm(scenario, link_couplings, monkeypatch):
 
 def test_no_force_shows_exchanged_axes(scenario, link_couplings):
     """Without the person the motor test passes, because motors and encoders are exchanged and reversed together."""
-    rehearsal = rehearsal_of(scenario, link_couplings, None, "exchange", "motor=-1", "reverse")
+    rehearsal = rehearsal_of(scenario, link_couplings, "exchange", "motor=-1", "reverse", operator=None)
     assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
 
 

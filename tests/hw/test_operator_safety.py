@@ -17,6 +17,7 @@ import pytest
 from causes import cause_of
 from messages import says
 from msgspec.structs import replace
+from sessions import rehearsal_of
 from shared import FakePort
 
 from haptic_loop.cli import bridge, replay
@@ -38,11 +39,6 @@ from haptic_loop.sim.scenario import InputError, load
 ROOT = Path(__file__).parent.parent.parent
 
 
-def rehearsal_of(scenario, link_couplings, operator):
-    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    return Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, operator=operator)
-
-
 # the deadman
 
 
@@ -58,7 +54,7 @@ def test_releasing_the_deadman_ramps_out(scenario, link_couplings, until):
             return True
         return since is None
 
-    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 10.0, there))
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=Operator(True, 10.0, there))
     session = rehearsal.run_until_armed(3.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "deadman: 1")
     at = {event.stage: event.t_us for event in session.log}
@@ -69,15 +65,14 @@ def test_releasing_the_deadman_ramps_out(scenario, link_couplings, until):
 
 @pytest.mark.slow
 def test_holding_the_deadman_continues_the_session(scenario, link_couplings):
-    session = rehearsal_of(scenario, link_couplings, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
+    session = rehearsal_of(scenario, link_couplings, operator=Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
 
 
 def test_a_release_ends_the_last_motor_test(scenario, link_couplings):
     """A person gives no sign after full gain. 1 s later, during the last motor test, the session stops."""
-    rehearsal = rehearsal_of(
-        scenario, link_couplings, Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
-    )
+    operator = Operator(True, 0.8, lambda: session.stage not in (Stage.ARMED, Stage.DISARMING))
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=operator)
     session = rehearsal.session
     rehearsal.run_until_armed(4.0)
     assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "deadman: 1")
@@ -126,7 +121,7 @@ def test_a_release_before_full_gain_ends_the_session(scenario, link_couplings):
 @pytest.mark.slow
 def test_any_key_shows_that_somebody_is_there(scenario, link_couplings):
     operator = Operator(True, 10.0, lambda: False)
-    rehearsal = rehearsal_of(scenario, link_couplings, operator)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=operator)
     for _ in range(5):
         session = rehearsal.run_until_armed(0.0) if rehearsal.armed_us is None else rehearsal.session
         rehearsal.run(1e-6 * session.now + 0.7)
@@ -276,7 +271,7 @@ def test_the_incident_log_survives_sigkill(tmp_path):
 @pytest.mark.slow
 def test_the_incident_log_grows_every_second(scenario, link_couplings, tmp_path):
     log = IncidentLog(tmp_path / "log")
-    rehearsal = rehearsal_of(scenario, link_couplings, Operator(True, 2.0))
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=Operator(True, 2.0))
     log.attach(rehearsal.session)
     steer = rehearsal.operator.decide
     rehearsal.operator.decide = lambda session, now: (log.update(session), steer(session, now))[1]
