@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -20,7 +18,7 @@ from haptic_loop.cli import options, render, session_cli
 from haptic_loop.cli.verdict import verdict
 from haptic_loop.cli.world import world_start
 from haptic_loop.design.certificate import named
-from haptic_loop.design.files import plain, write_json
+from haptic_loop.design.files import lost_output, plain, write_json
 from haptic_loop.design.result import CAVEATS, listed
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings, timed
 from haptic_loop.hw.limits import Stage
@@ -82,18 +80,13 @@ def main(argv: list[str]) -> int:
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
-    unprinted: OSError | None = None
-    try:  # The figures are printed before files are written, because either disk may be full.
-        _print_session(report, render.console(args), args.details)
-    except OSError as error:
-        unprinted = None if signal.SIGHUP in live.signals else error  # SIGHUP: the terminal is closed
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - for as long as the command runs
+    _print_session(report, render.console(args), args.details)  # before files, whose disk may be full
     files = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
-    if unprinted:
-        raise unprinted
+    if signal.SIGHUP in live.signals:  # The terminal is closed, so lost output is no error.
+        lost_output.clear()
     return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.program import OBJECTIVES, Options
-from haptic_loop.design.result import Design, DesignFailed, finite, listed
+from haptic_loop.design.result import Design, finite, listed
 from haptic_loop.design.robustness import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from haptic_loop.design import coverage
     from haptic_loop.design.api import Filed
     from haptic_loop.design.bound import Bound, BoundBeside
-    from haptic_loop.sim.stability import Ringing
 
 
 def main(argv: list[str]) -> int:
@@ -42,21 +41,19 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
-    if args.decay is not None and (is_world(scenario) or scenario.switches or args.varying_delay):
-        raise InputError("--decay: a world, or a loop with varying delays, has no damping ratios; leave it out")
     if is_world(scenario):
         from haptic_loop.cli import world
 
         return world.design(args, scenario, out, {} if args.limiter is not None else _options_of(args, args.coupling))
     loop = _loop(args, scenario)
     begun = _begun_bound(args, loop)
-    design, decay = _design(args, loop, scenario)
+    design = _design(args, loop)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before the bound.
     if slow:
         render.announce(args, verdicts.verdict(assessment))
-    report = replace(_reported(args, loop, design, assessment, stored, begun), ringing=decay)
+    report = _reported(args, loop, design, assessment, stored, begun)
     nearby = report.robustness
     verdict = verdicts.lost(assessment, nearby) if slow else verdicts.verdict(assessment, nearby)
     tables, lines = _tables(scenario, report)
@@ -81,8 +78,6 @@ def _parser() -> options.Parser:
     around = "vary stiffnesses and masses by PERCENT like a scenario's [ranges]: certify vertices, search between them"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("condition to certify (default: that of the coupling)")
-    ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
-    parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
     varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
@@ -152,8 +147,8 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     return values
 
 
-def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Return a design, with a proof if one was found, and the decay after an impulse (None without --decay).
+def _design(args: argparse.Namespace, loop: Loop) -> Design:
+    """Return a design, with a proof if one was found.
 
     Raises InputError for contradictory options, DesignFailed if no coupling was found.
     """
@@ -161,64 +156,7 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
 
     further = _options_of(args, args.coupling)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
-        make = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **further)
-        if args.decay is None:
-            return proved(loop, make(loop)), None
-        if not kind_of(args.coupling).for_less_damping:
-            able = " or ".join(name for name, kind in KINDS.items() if kind.for_less_damping)
-            raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
-    with render.progress("designing softer and softer couplings"):
-        design, decay = _decaying_design(scenario, loop, make, args.decay)
-        return proved(loop, design), decay
-
-
-#: shares of the devices' damping for which --decay designs, and the number of bisections between two shares
-_SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
-
-
-def _decaying_design(
-    scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
-) -> tuple[Design, Ringing | None]:
-    """Design softer couplings, for less and less damping, until no mode's damping ratio is below `ratio`.
-
-    A coupling certified for less damping is also certified for the devices' damping. Raises DesignFailed if the ratio
-    is not reached.
-    """
-    from haptic_loop.sim.run import assemble
-    from haptic_loop.sim.stability import ringing
-
-    def attempt(share: float) -> tuple[Design, Ringing]:
-        part = msgspec.structs.replace(loop, delta=tuple(share * delta for delta in loop.delta))
-        design = make(part)
-        if share < 1:
-            needs = named(design.required_condition).judge(loop.at(loop.environment), design.coupling)
-            design = replace(design, requirement=needs, certificate=None)
-        decay = ringing(assemble(scenario, design.coupling))
-        assert decay  # Worlds are refused, and with the spring of a coupling not all modes are free drifts.
-        return design, decay
-
-    tried: list[Ringing] = []
-    outside = 1.0
-    for share in _SHARES:
-        decaying = attempt(share)
-        tried.append(decaying[1])
-        if decaying[1].least_damping_ratio >= ratio:
-            inside = share
-            for _ in range(_BISECTIONS if share < 1 else 0):
-                between = attempt((inside + outside) / 2)
-                if between[1].least_damping_ratio >= ratio:
-                    inside, decaying = (inside + outside) / 2, between
-                else:
-                    outside = (inside + outside) / 2
-            return decaying
-        outside = share
-    best = max(tried, key=lambda each: each.least_damping_ratio)
-    reached = (
-        f"the best of {len(tried)} couplings has {best.least_damping_ratio:.4f} at {best.least_frequency_hz:.1f} Hz"
-    )
-    raise DesignFailed(
-        None, (), f"--decay {ratio:g}: none of the couplings tried gives every mode this damping ratio; {reached}"
-    )
+        return proved(loop, design_by_kind(loop, args.coupling, args.condition, progress, **further))
 
 
 def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
@@ -387,7 +325,6 @@ class _Report:
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     robustness: Robustness | None = render.several(render.robustness_rows)
-    ringing: Ringing | None = render.figure("slowest mode", "{.words}", default=None, json="if given")
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("problems solved", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)

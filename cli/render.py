@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from haptic_loop.cli.painter import skip_docstrings
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.files import InJson, discard_output, lost_output, plain, remove, write_json
+from haptic_loop.design.files import InJson, plain, remove, write_json
 from haptic_loop.design.result import DesignFailed, Requirement
 
 if TYPE_CHECKING:  # loaded only by commands that need them
@@ -122,7 +122,7 @@ def publish(
         announce(args, verdict)
     show(args, shown, lines, details)
     if folder:
-        _print(console(args), "files: " + ", ".join(outcome["files"]), soft_wrap=True)
+        console(args).print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
 
@@ -133,25 +133,14 @@ def show(
     """Print tables and lines, and with --details the details."""
     screen = console(args)
     for table in tables:
-        _print(screen, table)
+        screen.print(table)
     for line in (*lines, *(details if getattr(args, "details", False) else ())):
-        _print(screen, f"[dim]·[/] {line}")
+        screen.print(f"[dim]·[/] {line}")
 
 
 def announce(args: argparse.Namespace, verdict: str) -> None:
     """Print a verdict without breaking its line."""
-    _print(console(args), verdict, soft_wrap=True)
-
-
-def _print(screen: Screen, shown: Table | str, **how: Any) -> None:
-    """Print a part of a report. If standard output cannot be written, the command still stores the report's files."""
-    try:
-        screen.print(shown, **how)
-    except OSError as error:
-        if screen.stderr:
-            raise
-        lost_output.append(error)
-        discard_output()
+    console(args).print(verdict, soft_wrap=True)
 
 
 def remove_earlier(folder: Path, *files: str) -> None:

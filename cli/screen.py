@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from haptic_loop.controller.units import in_unit
-from haptic_loop.design.files import discard_output, printable
+from haptic_loop.design.files import discard_output, lost_output, printable
 
 _CUT = "…"  # rich's mark for a cut word
 _WIDEST = 400  # [characters] largest width of a table
@@ -33,11 +33,19 @@ class Screen(Console):
     """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print as rich does, but widen the console up to _WIDEST, so that no table loses a character."""
+        """Print as rich does, but widen the console up to _WIDEST, so that no table loses a character.
+
+        If standard output cannot be written, the command goes on without it, to store its files.
+        """
         own, objects = self._width, tuple(map(_in_unit, objects))
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
             super().print(*objects, **how)
+        except OSError as error:
+            if self.stderr:
+                raise
+            lost_output.append(error)
+            discard_output()
         finally:
             self._width = own
 

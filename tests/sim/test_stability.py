@@ -3,7 +3,6 @@
 Tolerances without a comment cover rounding.
 """
 
-import json
 from dataclasses import replace
 from functools import partial
 
@@ -12,16 +11,12 @@ import pytest
 from msgspec.structs import replace as change
 from scipy.linalg import expm
 
-from haptic_loop.cli.design import main as design_command
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.environment import GROUND, Network, Spring
-from haptic_loop.design.result import DesignFailed
 from haptic_loop.models.human import Human, Link
-from haptic_loop.models.scene import HumanSets, variants
-from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.run import assemble, make_engine, run
-from haptic_loop.sim.scenario import InputError, load, parse
+from haptic_loop.sim.scenario import load, parse
 from haptic_loop.sim.stability import (
     _NOT_EXCITED,
     Mode,
@@ -31,7 +26,6 @@ from haptic_loop.sim.stability import (
     dominant_mode,
     impulse_forces,
     impulse_growth,
-    mujoco_plants,
     ringing,
     stability_of,
     verdict,
@@ -211,36 +205,3 @@ def test_free_drifts_have_no_ringing():
     free = KNOCK.replace("1.5", "0.0").replace("2.0, stiffness = 150.0", "0.0, stiffness = 0.0")
     free += 'masses = { m = 1.0 }\nsprings = [{ between = ["a", "m"], stiffness = 0.0 }]'
     assert ringing(assemble(parse(free), NoCoupling())) is None
-
-
-@pytest.mark.slow
-def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys, monkeypatch):
-    path = tmp_path / "soft.json"
-    monkeypatch.setattr("haptic_loop.cli.design._BISECTIONS", 1)  # enough for the ratio, not for the stiffest coupling
-    assert design_command(["--decay", "0.01", "--out", str(path), "--json", str(tmp_path / "r.json")]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["assessment"]["guarantee"]["proof"] == "rational"
-    scenario = load()
-    simulation = assemble(scenario, read_coupling(path).built())
-    crowd = HumanSets((scenario.human,), scenario.person)
-    plants = mujoco_plants(variants(scenario.device, crowd), simulation.process, "exponential", 1)
-    loops = close(plants, simulation.F)
-    values = np.linalg.eigvals(loops.A[0]).astype(complex)
-    poles = np.log(values[np.abs(values) > 1e-6]) / scenario.T
-    ratio = (-poles.real / np.abs(poles)).min()
-    assert 0.01 <= report["ringing"]["least_damping_ratio"] == pytest.approx(ratio, rel=1e-4)
-    capsys.readouterr()
-    with pytest.raises(DesignFailed, match=r"^--decay 0.05: none of .* of 6 couplings has 0\.018\d at 83\.\d Hz$"):
-        design_command(["--coupling", "moving-average", "--decay", "0.05", "--out", str(path)])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--coupling", "optimal"], "--decay is for --coupling spring-damper or moving-average, not optimal"),
-        (["--scenario", "world-cube"], "--decay: a world, or a loop with varying delays"),
-    ],
-)
-def test_decay_is_refused_where_it_does_not_apply(options, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        design_command([*options, "--decay", "0.01", "--out", str(tmp_path / "c.json")])
