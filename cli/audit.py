@@ -16,7 +16,7 @@ from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import Requirement, listed
-from haptic_loop.models.device import CATALOGUE, Listed, listed_device
+from haptic_loop.models.device import CATALOGUE, listed_device
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 if TYPE_CHECKING:
@@ -29,19 +29,13 @@ _EXAMPLES = (
 )
 
 
-@dataclass(frozen=True)
-class _CatalogueDevice:
-    name: str
-    listed: Listed = off_table("inlined")
-
-
 @dataclass(frozen=True, eq=False)
 class _Report:
     """An audit and the sources of its numbers, in SI units; a missing figure is null, with a "reason"."""
 
     case: str
     scenario: str | None
-    device: _CatalogueDevice | None
+    device: dict[str, Any] | None  # name and figures of the listed device
     gains: str | None  # source of the listed device's gains; None if they are not used
     audit: Audit = off_table("inlined")
     notes: tuple[str, ...] = off_table()
@@ -57,11 +51,6 @@ def main(argv: list[str]) -> int:
     from haptic_loop.sim.couplings import from_file, qualified, read_coupling
 
     if args.devices:
-        extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
-        if extra:
-            raise InputError(
-                f"--devices with --{extra[0]}: the list is always the whole catalogue, leave out one of the two"
-            )
         return _list_devices(args)
     args = _with_device(args)
     if replaced := [name for name in ("world", "environment") if args.rigid and getattr(args, name)]:
@@ -94,7 +83,7 @@ def main(argv: list[str]) -> int:
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
-        _CatalogueDevice(args.device, CATALOGUE[args.device]) if args.device else None,
+        {"name": args.device} | render.plain(CATALOGUE[args.device]) if args.device else None,
         args.source if args.device else None,
         audited,
         notes,
@@ -135,11 +124,10 @@ def _parser() -> options.Parser:
     parser.add_details()
     parser.add_output()
     parser.only("without --rigid, whose wall replaces the scene", lambda args: not args.rigid, "world")
-    loop = ("reference", "scenario", "environment", "theta", "psi", "lam", "delta", "T", "T_max", "known_device")
-    rest = ("latency", "condition", "world", "varying_delay", "details", "out", "seed")
-    parser.only(
-        "without --devices: the list is always the whole catalogue", lambda args: not args.devices, *loop, *rest
-    )
+    others = "K B coupling device rigid reference scenario environment theta psi lam delta T T_max known_device "
+    others += "latency condition world varying_delay details out seed"
+    whole = "without --devices: the list is always the whole catalogue"
+    parser.only(whole, lambda args: not args.devices, *others.split())
     return parser
 
 

@@ -142,8 +142,6 @@ def _parser() -> argparse.ArgumentParser:
     band = "frequencies of the chirp [Hz] (default 3,200)"
     add("--band", type=options.pair, default=(3.0, 200.0), metavar="LOW,HIGH", help=band)
     add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of each chirp (default 2.5)")
-    rub = "dry friction of an emulated device (default 0)"
-    add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
     fast = "largest speed of a slow swing, up to which the bound holds (default 0.5)"
     add("--speed", type=number(0.05, 1.5), default=0.5, metavar="M/S", help=fast)
     far = "amplitude of the slow swing (default 30)"
@@ -152,11 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
     known = "two more sittings with clamped handles bound motor mass and transmission, for known-device"
     add("--transmission", action="store_true", help=known)
-    rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
-    add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     add_output_options(parser)
-    parser.only("with --rehearse", lambda args: args.rehearse, "hand")
-    parser.only("with --rehearse", lambda args: not args.port, "coulomb")
     parser.refuse("for commands with a coupling", "psi", "lam", "reference", "environment", "known_device")
     return parser
 
@@ -196,10 +190,10 @@ def _sitting(
             task = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {task}")
-    emulated = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
+    emulated = nobody(scenario, 0.0 if clamped is None else _CLAMPED)
     # `hold_session` counts time at full gain, which the gain reaches in the first 0.3 s, with zero force.
     seconds = played(1).seconds - 0.2
-    live = hold_session(args, session, plan, seconds, out, emulated, r * args.coulomb)
+    live = hold_session(args, session, plan, seconds, out, emulated)
     if number == 1:
         render.remove_earlier(out, "devices.toml", *(each.name for each in out.glob("trace-[0-9]*.npz")))
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None

@@ -238,15 +238,14 @@ def hold_session(
     seconds: float,
     out: Path,
     emulated: Scenario | None = None,
-    coulomb: float = 0.0,
 ) -> _Held:
     """Run a session from opening the port to its end, or in virtual time with an emulated device.
 
-    `emulated` is the scenario of the emulated device; None for that of the options. `coulomb` [N] is its dry friction.
+    `emulated` is the scenario of the emulated device; None for that of the options.
     """
     with ExitStack() as stack:
         if args.rehearse:
-            return _rehearsed(args, session, plan, seconds, out, emulated, coulomb)
+            return _rehearsed(args, session, plan, seconds, out, emulated)
         device = _device(args, session, stack)
         incidents = _logged(session, out)
         if args.port and not args.no_preflight:
@@ -330,12 +329,11 @@ def _rehearsed(
     seconds: float,
     out: Path,
     emulated: Scenario | None,
-    coulomb: float,
 ) -> _Held:
     """Run the session in virtual time; the emulated person arms once and holds the dead-man switch."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     with options.refused("the scenario cannot run behind a serial link: "):
-        emulator = Emulator(axis_by_axis(emulated or options.scenario_from(args)), faults, coulomb=coulomb)
+        emulator = Emulator(axis_by_axis(emulated or options.scenario_from(args)), faults)
     incidents = _logged(session, out)
     with progress("rehearsing") as move:
 

@@ -259,12 +259,9 @@ class _EmulatedPlant:
         return self._outside[row]
 
 
-def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scenario:
-    """Return the scenario without hands, persons and tap.
-
-    Each handle carries a damper of `damping` [N s/m] and a `mass` [kg]; a large mass clamps the handle.
-    """
-    return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * len(scenario.device), person=(), tap=None)
+def nobody(scenario: Scenario, mass: float = 0.0) -> Scenario:
+    """Return the scenario without hands, persons and tap. Each handle carries a `mass` [kg]; a large one clamps it."""
+    return scenario.replace(human=(Human((Link(mass, 0.0, 0.0),)),) * len(scenario.device), person=(), tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:

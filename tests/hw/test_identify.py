@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
 from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 
@@ -359,13 +361,19 @@ def test_damping_in_one_sitting_needs_a_third(tmp_path, monkeypatch):
         number = min(number, 2)
         return sittings.get(number) or sittings.setdefault(number, _sitting(args, scenario, settings, out, number))
 
+    def held(scenario, mass):
+        hand = Human((Link(mass, 0.0 if sittings else 0.3, 0.0),))
+        return nobody(scenario, mass).replace(human=(hand,) * len(scenario.device))
+
     monkeypatch.setattr("haptic_loop.cli.identify._sitting", recorded)
+    monkeypatch.setattr("haptic_loop.cli.identify.nobody", held)
+    monkeypatch.setattr("haptic_loop.cli.session_cli.Emulator", partial(Emulator, coulomb=0.02))
     one = tmp_path / "one.toml"
     text = (SCENARIOS / "one-wall.toml").read_text()
     one.write_text(text.replace('kind = "compliant"', 'kind = "rigid"\nmass = 0.25'))
     for count, code in ((2, 1), (3, 0)):
         out = tmp_path / str(count)
-        options = f"--rehearse --scenario {one} --measure 60 --seconds 0.5 --travel 8 --coulomb 0.02 --hand 0.3"
+        options = f"--rehearse --scenario {one} --measure 60 --seconds 0.5 --travel 8"
         assert identify_command([*options.split(), "--sittings", str(count), "--out", str(out)]) == code
         report = json.loads((out / "report.json").read_text())
         assert report["bounded"] == (code == 0) == (out / "devices.toml").exists()
@@ -459,8 +467,6 @@ def test_a_record_with_gaps_gives_no_bound():
         (["--band", "200,3"], "--band is 200,3"),
         (["--band", "3,1000"], "within 0.5 to 333 Hz"),
         (["--force", "20"], "--force is 20 .. 0.05 to 6"),
-        (["--coulomb", "-1"], "--coulomb is -1"),
-        (["--hand", "0.1"], "--hand is only with --rehearse"),
         (["--sittings", "0"], "--sittings is 0 .. 1 to 20"),
     ],
 )

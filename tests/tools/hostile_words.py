@@ -21,7 +21,7 @@ NUMERIC = {
     "compare": "points band seconds",
     "export": "seed",
     "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
-    "identify": "force band seconds coulomb sittings hand",
+    "identify": "force band seconds sittings",
 }
 
 
