@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.controller.arithmetic import rational, spend
+from haptic_loop.controller.arithmetic import fractions, spend
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 
 # ----------------------------------------------------------------------------------------------------
-# Matrices over the rationals: integers over one common denominator, and exact tests of definiteness. A floating-point
-# number stands for its shortest decimal, the one that a person wrote in the file: 0.0012 is 12/10000 here.
+# Matrices over the rationals: integers over one common denominator, and an exact test for negative minors. A
+# floating-point number stands for its shortest decimal, the one that a person wrote in the file: 0.0012 is 12/10000.
 
 
 _Integers = NDArray[np.object_]
@@ -34,44 +34,22 @@ class Matrix:
     @classmethod
     def of(cls, rows: Any, shape: Any = None) -> Matrix:
         """Convert rows of floats (read as decimals), integers, fractions or strings "p/q" to a Matrix of this shape."""
-        entries = [[rational(v) for v in row] for row in rows]
-        shape = shape or getattr(rows, "shape", None) or (len(entries), len(entries[0]) if entries else 0)
-        den = math.lcm(*(v.denominator for row in entries for v in row))
-        num = np.empty(shape, dtype=object)
-        for i, row in enumerate(entries):
-            for j, v in enumerate(row):
-                num[i, j] = v.numerator * (den // v.denominator)
-        return cls(num, den)
-
-    @classmethod
-    def zeros(cls, rows: int, columns: int) -> Matrix:
-        return cls(np.zeros((rows, columns), dtype=object))
+        entries = fractions(rows)
+        den = math.lcm(*(v.denominator for v in entries.ravel()))
+        num = np.vectorize(lambda v: v.numerator * (den // v.denominator), otypes=[object])(entries)
+        return cls(num.reshape(shape or num.shape), den)
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.num.shape
 
-    @property
-    def T(self) -> Matrix:
-        return Matrix(self.num.T, self.den)
-
-    def reduced(self) -> Matrix:
-        """Return the same matrix in lowest terms."""
-        common = math.gcd(self.den, *self.num.ravel())
-        return self if common == 1 else Matrix(self.num // common, self.den // common)
-
     def fractions(self) -> NDArray[np.object_]:
         """Return a (p, m) array of Fraction."""
-        return np.array([[Fraction(int(v), self.den) for v in row] for row in self.num], dtype=object).reshape(
-            self.shape
-        )
+        return np.vectorize(lambda v: Fraction(v, self.den), otypes=[object])(self.num)
 
     def floats(self) -> NDArray[np.float64]:
         """Return (p, m) floats, every entry correctly rounded."""
-        return np.array([[int(v) / self.den for v in row] for row in self.num], dtype=np.float64).reshape(self.shape)
-
-    def equals(self, other: Matrix) -> bool:
-        return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
+        return np.vectorize(lambda v: v / self.den, otypes=[np.float64])(self.num)
 
 
 _LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and of each bit of the two integers
@@ -98,65 +76,26 @@ def _congruence(X: _Integers, M: _Integers) -> _Integers:
     return product.reshape(m, m)
 
 
-@dataclass(frozen=True)
-class _Definiteness:
-    """The result of the exact elimination of a symmetric matrix.
+def negative_minor(S: Any) -> str | None:
+    """Return a negative principal minor of the symmetric rational S (m, m) in words, or None if S is semidefinite.
 
-    Attributes:
-        definite: Whether the matrix is positive definite.
-        semidefinite: Whether the matrix is positive semidefinite.
-        rows: The rows, from 1, of a principal minor that is zero if the matrix is semidefinite and negative if it is
-            not; () for a definite matrix.
+    The elimination S = LDL' is exact. A pivot has the sign of the principal minor of its row and of the rows before it
+    that were not skipped. If a pivot is zero, S is semidefinite only if the pivot's entire row in the Schur complement
+    is zero; the row is then skipped. Otherwise any other entry of this row makes a principal minor negative.
     """
-
-    definite: bool
-    semidefinite: bool
-    rows: tuple[int, ...] = ()
-
-    def __str__(self) -> str:
-        if self.definite:
-            return "positive definite"
-        order = len(self.rows)
-        leading = self.rows == tuple(range(1, order + 1))
-        minor = (
-            f"leading minor of order {order}"
-            if leading
-            else f"principal minor of rows {', '.join(map(str, self.rows))}"
-        )
-        return f"the {minor} is {'zero' if self.semidefinite else 'negative'}"
-
-
-_MANY_ROWS = 8  # Above this number of rows `_strictly_positive` is tried first, because elimination is slower.
-
-
-def definiteness(S: Matrix) -> _Definiteness:
-    """Decide whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
-
-    Each pivot is the principal minor of its row and the rows before it that were not skipped. If a pivot is zero, S is
-    semidefinite only if the pivot's entire row in the Schur complement is zero; the row is then skipped. Otherwise an
-    entry e of this row gives the negative minor -e^2/(previous pivot). Raises ValueError if S is not exactly symmetric.
-    """
-    if S.shape[0] > _MANY_ROWS and _strictly_positive(S):
-        return _Definiteness(True, True)
-    work = S.reduced().num.copy()
-    if not (work == work.T).all():
-        raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
-    previous, used = 1, list[int]()  # the last positive pivot, and the rows of the positive pivots
-    singular: tuple[int, ...] = ()
-    for k in range(work.shape[0]):
-        pivot, column = work[k, k], work[k + 1 :, k].copy()
-        rows = (*used, k + 1)
-        if pivot < 0:
-            return _Definiteness(False, False, rows)
-        if pivot == 0:
-            if coupled := np.flatnonzero(column != 0).tolist():
-                return _Definiteness(False, False, (*rows, k + 2 + coupled[0]))
-            singular = singular or rows
-            continue
-        work[k + 1 :, k + 1 :] = (pivot * work[k + 1 :, k + 1 :] - np.outer(column, column)) // previous
-        previous = pivot
-        used.append(k + 1)
-    return _Definiteness(not singular, True, singular)
+    work, used = fractions(S).copy(), list[int]()  # `used` are the rows of positive pivots, counted from 1.
+    for k in range(len(work)):
+        pivot, column = work[k, k], work[k + 1 :, k]
+        coupled = np.flatnonzero(column).tolist()
+        if pivot > 0:
+            used.append(k + 1)
+            work[k + 1 :, k + 1 :] -= np.outer(column, column) / pivot
+        elif pivot < 0 or coupled:
+            rows = [*used, k + 1] if pivot < 0 else [*used, k + 1, k + 2 + coupled[0]]
+            if rows == list(range(1, len(rows) + 1)):
+                return f"the leading minor of order {len(rows)} is negative"
+            return f"the principal minor of rows {', '.join(map(str, rows))} is negative"
+    return None
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -166,23 +105,8 @@ def definiteness(S: Matrix) -> _Definiteness:
 # (Gershgorin). Elimination would be exact, too, but its numbers grow with every pivot.
 
 
-_BITS = 192  # binary places to which a matrix is rounded before the test of its definiteness
 _FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; all entries are multiples of one unit
-GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
-
-
-def _strictly_positive(S: Matrix) -> bool:
-    """Return whether S > 0 is proved, for an exactly symmetric S (n, n).
-
-    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-_BITS, so that
-    the products have short numbers. The error is at most 2^-_BITS / 2 per entry, hence at most n 2^-_BITS in norm,
-    which is subtracted from the diagonal. Raises ValueError if S is asymmetric.
-    """
-    if not (S.num == S.num.T).all():
-        raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
-    if any(v <= 0 for v in np.diag(S.num)):
-        return False
-    return _definite(_less(_rounded(S, _halves(S), _BITS), S.shape[0]), _BITS)
+_GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
 def _halves(S: Matrix) -> list[int]:
@@ -263,7 +187,7 @@ def _whitening(W: Array) -> _Integers | None:
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
     if not np.isfinite(W).all():  # An entry is far too large for the diagonal.
         return None
-    for added in (0.0, GROWTH):
+    for added in (0.0, _GROWTH):
         try:
             L = np.linalg.cholesky(W + added * np.eye(len(W)))
         except np.linalg.LinAlgError:
@@ -336,7 +260,7 @@ def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
     n = G.order
     if P.shape != (n, n):
         return f"P has shape {P.shape}, the block has {n} states"
-    if not P.equals(P.T):
+    if not (P.num == P.num.T).all():
         return "P is not symmetric"
     if _refuted_in_floating_point(G, P):
         return "the KYP matrix has a negative direction, beyond the error bound of floating point"
@@ -416,7 +340,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
         kind = Violated if margin < -_CLEARLY else str
         return None, kind(f"the condition is violated at {w:.6g} rad/sample")
     if G.order == 0:
-        empty = Matrix.zeros(0, 0)
+        empty = Matrix(np.zeros((0, 0), dtype=object))
         reason = _prove_positive_real(G, empty)
         return None if reason else empty, reason
     reason = None
@@ -554,13 +478,16 @@ def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
 
 
 def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> Matrix:
-    """Return numbers/2^power, with row i and column i divided by 2^half[i] for all i."""
+    """Return numbers/2^power in lowest terms, with row i and column i divided by 2^half[i] for all i."""
     most = int(max(half))
     for i, row in enumerate(numbers):
         for j in range(len(row)):
             row[j] <<= 2 * most - int(half[i]) - int(half[j])
     power += 2 * most
-    return Matrix(numbers, 1 << power).reduced() if power >= 0 else Matrix(numbers * (1 << -power))
+    if power < 0:
+        return Matrix(numbers << -power)
+    common = math.gcd(1 << power, *numbers.ravel())
+    return Matrix(numbers // common, (1 << power) // common)
 
 
 def _shortened(P: Matrix) -> Matrix:
