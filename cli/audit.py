@@ -325,11 +325,11 @@ def _remarks(report: _Report) -> Iterator[str]:
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
     """Yield the changes that certify the coupling, the least required damping first, or that there are none."""
-    enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
+    enough = [each for each in helps if each.requirement.certified]
     if not enough:
         yield "What helps: no change of delay, damper or period alone was found to suffice; a design finds other gains."
-    for each in enough:
-        needs = f"{each.condition} then needs {listed(each.required_damping)} N s/m, certified"
+    for each in sorted(enough, key=lambda each: max(each.requirement.required)):
+        needs = f"{each.requirement.condition} then needs {listed(each.requirement.required)} N s/m, certified"
         yield f"What helps: {each.change} ({needs})."
 
 

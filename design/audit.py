@@ -25,12 +25,11 @@ from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import conditions_of, named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.design.files import InputError, off_table
+from haptic_loop.design.files import off_table
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.necessary import LeftOver, left_over
-from haptic_loop.design.own import place_of
-from haptic_loop.design.result import CAVEATS, GUARD, ConditionName, Requirement, listed, refusal, suffices
+from haptic_loop.design.result import CAVEATS, GUARD, Requirement, listed, refusal, suffices
 from haptic_loop.design.worst_member import Progress
 
 if TYPE_CHECKING:
@@ -38,30 +37,14 @@ if TYPE_CHECKING:
 
 LONGEST_DELAY = 100  # samples; beyond it a sweep takes seconds, and no device has enough damping
 
-_Condition = ConditionName | Condition
-
-
-def requirement(loop: Loop, coupling: Coupling, condition: _Condition) -> Requirement:
-    """Return the damping that the condition requires of the devices; infinite if the loop is singular."""
-    resolved = named(condition)
-    try:
-        return resolved.judge(loop, coupling)
-    except (TooLong, InputError):
-        raise
-    except ValueError as error:  # The algebraic loop has no solution, or a user's own code is wrong.
-        if place_of(error):
-            raise
-        return refusal(resolved.name, loop.delta, str(error))
-
 
 def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
     """Return the requirement of a condition after changes of the loop's fields; infinite for an impossible loop."""
     try:
-        return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
-    except TooLong:
-        raise
+        varied = msgspec.structs.replace(loop, **changes)
     except ValueError as error:  # The latency may exceed a shorter period.
         return refusal(condition.name, loop.delta, str(error))
+    return condition.judge(varied, coupling)
 
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
@@ -95,7 +78,6 @@ _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
 _SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside it is smaller; else the ratio may jump.
-_NOT_CERTIFIED = "not certified, so there are no margins"
 
 
 @dataclass(frozen=True)
@@ -121,22 +103,23 @@ class _Sensitivity:
     reason: str | None = off_table("if given", None)
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest:
+def _stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
     """Return the largest certified K: channel by channel if the condition is separable, else a common multiple of K."""
-    unknown, resolved = (None,) * loop.channels, named(condition)
+    unknown = (None,) * loop.channels
     gains = coupling.figures(loop.T)
     if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
-    if resolved.separable(loop):
-        reason = resolved.not_varied(loop) or resolved.beyond(loop)
-        return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], resolved)
-    if reason := resolved.not_varied(loop):
+    reason = condition.not_varied(loop)
+    if condition.separable(loop):
+        reason = reason or condition.beyond(loop)
+        return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], condition)
+    if reason:
         return _Stiffest(unknown, reason)
     K = np.array(gains["K"])
 
     @cache
     def ratio(scale: float) -> float:
-        return requirement(loop, coupling.scaled(stiffness=scale), resolved).ratio
+        return condition.judge(loop, coupling.scaled(stiffness=scale)).ratio
 
     scale = _STIFFEST / K.max()
     if suffices(ratio(scale)):
@@ -185,18 +168,15 @@ def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
     return None
 
 
-def sensitivity(
-    loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None
-) -> _Sensitivity:
-    """Return the errors in delta, T and delay that the certificate tolerates; `needs` is the requirement, if known."""
-    resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
+def _sensitivity(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> _Sensitivity:
+    """Return the errors in delta, T and delay that the certificate tolerates; `needs` is the requirement."""
     if not needs.certified:
-        return _Sensitivity(reason=_NOT_CERTIFIED)
-    if reason := resolved.not_varied(loop):
+        return _Sensitivity(reason="not certified, so there are no margins")
+    if reason := condition.not_varied(loop):
         return _of_delta(needs, reason)
     fixed = loop.environment.one_period
-    largest = None if fixed else _largest_period(loop, coupling, resolved)
-    extra = _extra_samples(loop, coupling, resolved)
+    largest = None if fixed else _largest_period(loop, coupling, condition)
+    extra = _extra_samples(loop, coupling, condition)
     tried = (
         "the environment is given for one T only"
         if fixed
@@ -282,30 +262,34 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
 _FACTORS = (0.75, 0.5, 0.25, 0.1)  # factors on B and T that are tried
 
 
-@dataclass(frozen=True, eq=False)
-class _Remedy:
+@dataclass(frozen=True)
+class Help:
     """The mildest change of one kind that certifies the coupling, or else the change with the least requirement."""
 
     change: str
-    requirement: Requirement
+    requirement: Requirement  # after the change
+
+    def part(self) -> dict[str, Any]:
+        needs = self.requirement
+        part: dict[str, Any] = {"change": self.change, "condition": needs.condition}
+        return part | {"required_damping": needs.required, "certified": needs.certified}
 
 
-def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower its requirement (`needs`, if known) by over 10 %."""
-    resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
-    if needs.certified or resolved.not_varied(loop):
+def _helps(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> list[Help]:
+    """Return single changes that certify the coupling or lower its requirement `needs` by over 10 %."""
+    if needs.certified or condition.not_varied(loop):
         return []
-    candidates = [_fewer_samples(loop, coupling, resolved, name) for name in ("theta", "psi")]
+    candidates = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
     if any(B := coupling.figures(loop.T).get("B", ())):
         candidates.append(
             _smaller(
-                lambda x: requirement(loop, coupling.scaled(damping=x), resolved),
+                lambda x: condition.judge(loop, coupling.scaled(damping=x)),
                 lambda x: f"damper B = {listed([x * b for b in B], 5)} N s/m",
             )
         )
     candidates.append(
         _smaller(
-            lambda x: _at_period(loop, coupling, resolved, x * loop.T),
+            lambda x: _at_period(loop, coupling, condition, x * loop.T),
             lambda x: f"period T = {1e3 * x * loop.T:.5g} ms",
         )
     )
@@ -313,29 +297,29 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requ
     return [r for r in candidates if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> Help | None:
     """Return the least reduction of the delays `name`, one for all channels, that certifies, or else the best one."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
         needs = _varied(loop, coupling, condition, lam=(0,) * loop.channels, **{name: less})
-        tried.append(_Remedy(f"delay {name} = {listed(less, 5)}", needs))
+        tried.append(Help(f"delay {name} = {listed(less, 5)}", needs))
         if tried[-1].requirement.certified:
             return tried[-1]
-    return min(tried, key=lambda remedy: remedy.requirement.ratio, default=None)
+    return min(tried, key=lambda each: each.requirement.ratio, default=None)
 
 
-def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the remedy with the largest factor that certifies, rounded down to 0.001, else of least requirement."""
+def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> Help:
+    """Return the change with the largest factor that certifies, rounded down to 0.001, else of least requirement."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
             mildest = edge(lambda x: needs(x).ratio, factor, larger)
             printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # The printed factor must certify.
             mildest = printable if needs(printable).certified else factor
-            return _Remedy(describe(mildest), needs(mildest))
+            return Help(describe(mildest), needs(mildest))
     best = min(_FACTORS, key=lambda x: needs(x).ratio)
-    return _Remedy(describe(best), needs(best))
+    return Help(describe(best), needs(best))
 
 
 @dataclass(frozen=True)
@@ -344,16 +328,6 @@ class Margins:
 
     stiffest: _Stiffest
     sensitivity: _Sensitivity
-
-
-@dataclass(frozen=True)
-class Help:
-    """A change that helps, and the requirement after it."""
-
-    change: str
-    condition: str
-    required_damping: tuple[float, ...]
-    certified: bool
 
 
 @dataclass(frozen=True)
@@ -422,10 +396,12 @@ def _searched(
 
     Changes are searched for the condition `wanted` or, if it is certified, for the first that is not certified.
     """
-    needs = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
+    needs = {name: each.judge(loop, coupling) for name, each in conditions.items()}
     fails = next((name for name in conditions if needs[wanted].certified and not needs[name].certified), wanted)
-    margins = _margins(loop, coupling, conditions[wanted], needs[wanted])
-    return margins, _helps(loop, coupling, conditions[fails], needs[fails]) if helping else []
+    margins, failing = _margins(loop, coupling, conditions[wanted], needs[wanted]), (conditions[fails], needs[fails])
+    if not helping:
+        return margins, []
+    return margins, _in_time(loop, coupling, lambda: _helps(loop, coupling, *failing), lambda why: [])
 
 
 _SWEEPS = 60  # typical number of sweeps of a search
@@ -438,26 +414,21 @@ def _in_time(
 ) -> _Result:
     """Return the result of a search by many sweeps, or `without(reason)` if it takes too long."""
     try:
-        if reason := budgets.too_long(loop.F(coupling), _SWEEPS):
-            return without(f"not searched: {reason}")
+        reason = budgets.too_long(loop.F(coupling), _SWEEPS)
+    except ValueError:  # The loop has no force map; its requirement has the reason.
+        reason = None
+    if reason:
+        return without(f"not searched: {reason}")
+    try:
         with budgets.sweeping():
             return search()
     except TooLong as error:
         return without(str(error))
-    except ValueError:  # The loop has no force map; its requirement has the reason.
-        return search()
 
 
 def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Margins:
     unknown, subject = (None,) * loop.channels, (loop, coupling, condition)
     return Margins(
-        _in_time(loop, coupling, lambda: stiffest(*subject), lambda why: _Stiffest(unknown, why)),
-        _in_time(loop, coupling, lambda: sensitivity(*subject, needs), lambda why: _of_delta(needs, why)),
+        _in_time(loop, coupling, lambda: _stiffest(*subject), lambda why: _Stiffest(unknown, why)),
+        _in_time(loop, coupling, lambda: _sensitivity(*subject, needs), lambda why: _of_delta(needs, why)),
     )
-
-
-def _helps(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> list[Help]:
-    """Return changes that certify a failing condition or lower its required damping."""
-    helpful = _in_time(loop, coupling, lambda: _remedies(loop, coupling, condition, needs), lambda why: [])
-    pairs = ((remedy.change, remedy.requirement) for remedy in helpful)
-    return [Help(change, condition.name, after.required, after.certified) for change, after in pairs]

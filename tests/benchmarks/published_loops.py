@@ -16,9 +16,8 @@ from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.api import design_coupling, transparency_of
 from haptic_loop.design.assessment import assess
-from haptic_loop.design.audit import requirement
 from haptic_loop.design.bound import bound
-from haptic_loop.design.certificate import judged
+from haptic_loop.design.certificate import judged, required_damping
 from haptic_loop.design.designs import KINDS, design_by_kind
 from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.result import DesignFailed
@@ -40,8 +39,8 @@ def cheap(path: Path) -> dict[str, float | None]:
     figures |= {"growth_without_coupling_per_s": float(mode.growth), "growth_frequency_hz": float(mode.frequency_hz)}
     figures["without_coupling"] = _here(loop, NoCoupling())
     figures["reference_this_environment"] = _here(loop, reference)
-    figures["reference_any_environment"] = requirement(loop, reference, "any-environment").ratio
-    known = requirement(loop, reference, "known-device").ratio if loop.known_devices else None
+    figures["reference_any_environment"] = required_damping(loop, reference, "any-environment").ratio
+    known = required_damping(loop, reference, "known-device").ratio if loop.known_devices else None
     return figures | {"reference_known_device": known}
 
 
@@ -49,7 +48,7 @@ def _here(loop: Loop, coupling: Coupling) -> float:
     """Return required over available damping for this-environment, under any switching if delays switch."""
     if loop.varying_delay:
         return judged(loop, coupling, SWITCHING).ratio
-    return requirement(loop, coupling, "this-environment").ratio
+    return required_damping(loop, coupling, "this-environment").ratio
 
 
 def designed(path: Path) -> float | None:

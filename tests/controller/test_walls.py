@@ -21,8 +21,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.tick import Process
 from haptic_loop.design.assessment import assess
-from haptic_loop.design.audit import requirement
-from haptic_loop.design.certificate import prove, requirements_of
+from haptic_loop.design.certificate import prove, required_damping, requirements_of
 from haptic_loop.design.result import ANY, MAKING
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.hold import hold
@@ -279,13 +278,13 @@ def test_stiffer_couplings_are_certified_for_known_walls():
     1772 N/m with B = 0.453 is certified only while the wall stays open or stays closed.
     """
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
-    assert requirement(loop, coupling, "this-environment").certified
-    assert not requirement(loop, coupling, "any-environment").certified
+    assert required_damping(loop, coupling, "this-environment").certified
+    assert not required_damping(loop, coupling, "any-environment").certified
     assert assess(loop, coupling, limiter=False).guarantee.environments == MAKING
     stiff = SpringDamper([1772.0], [0.453])
-    assert not requirement(loop, stiff, "this-environment").certified
+    assert not required_damping(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())
-    assert requirement(loop.at(held(loop.network, [False])), coupling, "this-environment").ratio == 0
+    assert required_damping(loop.at(held(loop.network, [False])), coupling, "this-environment").ratio == 0
 
 
 def test_couplings_with_a_model_refuse_walls():

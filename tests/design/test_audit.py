@@ -22,7 +22,8 @@ from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import budgets, certificate, coupling_file
 from haptic_loop.design.api import certify
 from haptic_loop.design.assessment import assess
-from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _remedies, audit, edge, requirement, sensitivity, stiffest
+from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _helps, _sensitivity, _stiffest, audit, edge
+from haptic_loop.design.certificate import named, required_damping
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import ANY, CAVEATS, GUARD, HERE, suffices
 from tests.evaluate import needs, safe_with
@@ -36,6 +37,24 @@ def pair(coupling, **changes) -> tuple[Loop, Coupling]:
     """Return the default scenario's loop with `changes`, and the coupling."""
     loop = {"T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37), "environment": FIGURE_4} | changes
     return Loop(lam=loop["theta"], **loop), coupling
+
+
+def stiffest(*subject):
+    """Return the largest certified K of a loop and a coupling by the condition of this name."""
+    loop, coupling, condition = subject
+    return _stiffest(loop, coupling, named(condition))
+
+
+def sensitivity(*subject):
+    """Return the tolerated errors of a loop with a coupling by the condition of this name."""
+    loop, coupling, condition = subject
+    return _sensitivity(loop, coupling, named(condition), required_damping(*subject))
+
+
+def helps(*subject):
+    """Return the changes that help a coupling in a loop to satisfy the condition of this name."""
+    loop, coupling, condition = subject
+    return _helps(loop, coupling, named(condition), required_damping(*subject))
 
 
 def report(*subject):
@@ -77,8 +96,8 @@ def strict(text: str) -> dict:
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
     """Without delay a wall needs K T/2 + B. One sample late a spring needs 3 K T/2, and 2 K T for any environment."""
     subject = wall(K, B, theta)
-    assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
-    assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
+    assert required_damping(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
+    assert required_damping(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
 
 
 @pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
@@ -111,8 +130,8 @@ def test_impossible_rigid_walls_are_refused():
 def test_a_rigid_wall_needs_what_stiff_springs_need():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))  # softens K = 2000 N/m by 2e-6 of K
     loop, coupling = wall(2000, 0.4, 1)
-    ratio = requirement(loop.at(ground), coupling, "this-environment").ratio
-    assert ratio == pytest.approx(requirement(loop, coupling, "this-environment").ratio, rel=1e-5)
+    ratio = required_damping(loop.at(ground), coupling, "this-environment").ratio
+    assert ratio == pytest.approx(required_damping(loop, coupling, "this-environment").ratio, rel=1e-5)
 
 
 @pytest.mark.parametrize(("condition", "theta", "K"), [("this-environment", 0, 2340), ("any-environment", 0, 2340)])
@@ -129,7 +148,7 @@ def test_the_stiffest_gains_respect_full_levels():
     expected = 2 * (np.linalg.eigvalsh(level)[0] - 0.05) / 1e-3
     K = stiffest(loop, SpringDamper([100.0] * 2, [0.05] * 2), "any-environment").K
     assert np.array(K) == pytest.approx(expected, rel=1e-6)
-    assert requirement(loop, SpringDamper(K, [0.05] * 2), "any-environment").certified
+    assert required_damping(loop, SpringDamper(K, [0.05] * 2), "any-environment").certified
     beyond = stiffest(loop, SpringDamper([100.0] * 2, [0.3] * 2), "any-environment")
     assert beyond.K == (None, None)
     assert "no multiple of K" in beyond.reason
@@ -142,7 +161,7 @@ def test_stiffest_axes_of_late_devices_hold_together():
     late = {"axes": (2,), "latency": ((0.0, 5e-4),) * 2}
     loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.5, 0.9), plane, **late)
     K = stiffest(loop, SpringDamper([1500.0, 900.0], [0.3] * 2), "any-environment").K
-    assert requirement(loop, SpringDamper(K, [0.3] * 2), "any-environment").certified
+    assert required_damping(loop, SpringDamper(K, [0.3] * 2), "any-environment").certified
 
 
 @pytest.mark.validate
@@ -152,11 +171,11 @@ def test_the_stiffest_gains_of_late_forces_are_certified(B):
     loop, coupling = wall(100, B, theta=1, delta=0.9)
     loop = msgspec.structs.replace(loop, latency=((0.0, 9e-4),))
     margin = stiffest(loop, coupling, "any-environment")
-    certified = [K for K in (1.0, 100.0) if requirement(loop, SpringDamper([K], [B]), "any-environment").certified]
+    certified = [K for K in (1.0, 100.0) if required_damping(loop, SpringDamper([K], [B]), "any-environment").certified]
     assert (margin.K[0] is None) == (not certified)
     if certified:
         assert margin.K[0] >= certified[-1]
-        assert requirement(loop, SpringDamper(margin.K, [B]), "any-environment").certified
+        assert required_damping(loop, SpringDamper(margin.K, [B]), "any-environment").certified
     else:
         assert f"with B = {B:g} N s/m, no K" in margin.reason
 
@@ -194,7 +213,7 @@ def test_optimal_gains_rounded_up_fail_any_environment():
 def test_certification_ends_at_the_reported_edges(subject, condition):
     """An edge errs by at most 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond it."""
     loop, coupling = subject
-    needs = requirement(loop, coupling, condition)
+    needs = required_damping(loop, coupling, condition)
     assert needs.certified
     edges = sensitivity(loop, coupling, condition)
     K = np.array(stiffest(loop, coupling, condition).K)
@@ -212,8 +231,8 @@ def test_certification_ends_at_the_reported_edges(subject, condition):
         (change(loop, theta=[n + 1 for n in later]), coupling),
         (change(loop, delta=tuple(least * (1 - 1e-6))), coupling),
     ]
-    assert [requirement(*s, condition).certified for s in inside] == [True] * 4
-    assert [requirement(*s, condition).certified for s in outside] == [False] * 4
+    assert [required_damping(*s, condition).certified for s in inside] == [True] * 4
+    assert [required_damping(*s, condition).certified for s in outside] == [False] * 4
 
 
 def test_figures_that_do_not_exist_have_a_reason():
@@ -229,22 +248,22 @@ def test_figures_that_do_not_exist_have_a_reason():
 
 def test_remedies_are_evaluated_and_no_larger_than_needed():
     subject = wall(5000, 0.5, 1)
-    changes = {r.change.split(" ")[0]: r for r in _remedies(*subject, "this-environment")}
+    changes = {r.change.split(" ")[0]: r for r in helps(*subject, "this-environment")}
     assert changes["delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["delay"].requirement.certified
     assert changes["period"].requirement.certified
     assert changes["period"].requirement.required[0] > 0.98 * 1.37
-    assert _remedies(*wall(500, 0), "this-environment") == []
+    assert helps(*wall(500, 0), "this-environment") == []
     assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 
 
 def test_delayed_environments_need_a_multiplier():
-    needs = requirement(*pair(SAFE, psi=(1, 1)), "any-environment")
+    needs = required_damping(*pair(SAFE, psi=(1, 1)), "any-environment")
     assert not needs.certified
     assert "the environment alone uses up" in needs.reason
     softer = Network(("a",), (Spring(("a", GROUND), 100.0, 0.2),))
     subject = Loop(T, (0,), (1,), (0,), (1.37,), softer), SpringDamper([200.0], [0.2])
-    assert requirement(*subject, "any-environment").certified
+    assert required_damping(*subject, "any-environment").certified
     assert "multiplier" in stiffest(*subject, "any-environment").reason
 
 
@@ -501,7 +520,7 @@ def test_long_computations_are_refused_or_ended(monkeypatch):
     assert part["stiffest"]["K"] == [None, None]
     assert "0.001 s" in part["stiffest"]["reason"]
     monkeypatch.setattr(budgets, "SWEEPS", 1e-5)
-    assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason
+    assert "a sweep over 8 states and 2 channels would take" in required_damping(PAIR, SOFT, "this-environment").reason
 
 
 def test_tables_of_switching_loops_use_constant_delays(run):
