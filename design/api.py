@@ -42,7 +42,6 @@ class DesignOptions(TypedDict, total=False):
     """Options of the kinds in design.designs.KINDS."""
 
     order: int  # ccl: states per channel
-    diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
     limiter: bool  # cover limited forces, too; by default only a spring-damper by this-environment tries to
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment

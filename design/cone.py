@@ -7,9 +7,8 @@ next of the solver settings is tried.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,35 +27,26 @@ _TOLERANCE = 1e-4
 _LARGE, _MANY = 300, 4
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """Options of Clarabel that differ from its defaults."""
-
-    name: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
 #: The blocks are dense. A search for a chordal decomposition takes a third of the time and finds none.
 _DENSE = {"chordal_decomposition_enable": False}
 _TIGHT = {**_DENSE, "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {**_DENSE, "tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
 
-SETTINGS = (
-    _Settings("default", _DENSE),
-    _Settings("tight", {**_TIGHT, "max_step_fraction": 0.95}),
-    _Settings("as given", {**_DENSE, "equilibrate_enable": False}),
-    _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
-)
-INTERIOR = _Settings("interior")  # `_interior`, for large blocks with few unknowns
+#: Settings of Clarabel, by name: the options that differ from its defaults.
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "default": _DENSE,
+    "tight": {**_TIGHT, "max_step_fraction": 0.95},
+    "as given": {**_DENSE, "equilibrate_enable": False},
+    "loose": {**_LOOSE, "static_regularization_constant": 1e-7},
+}
+INTERIOR = "interior"  # the setting that solves the problem by `_interior`, for large blocks with few unknowns
 
 
 @dataclass(frozen=True)
 class _Attempt:
     settings: str
     status: str
-    value: float | None  # the objective; None if the result is refused
-    wall_s: float
-    reason: str | None = None  # reason of the refusal
+    reason: str | None  # reason why the result may not be used, or None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,27 +108,29 @@ class ConeProgram:
     blocks: Sequence[Inequality]
 
     def solve(
-        self, problem: str, accept: Callable[[Array], bool] | None = None, settings: Sequence[_Settings] | None = None
+        self, problem: str, accept: Callable[[Array], bool] = lambda x: True, settings: Iterable[str] = ()
     ) -> Array:
-        """Return the optimal x (p,), verified, also by `accept`. `problem` names the problem in error messages.
+        """Return the optimal x (p,), verified.
+
+        Args:
+            problem: The name of the problem in error messages.
+            accept: A further verification of x.
+            settings: Names of the settings in the order of their trial. Without them, INTERIOR solves a problem with a
+                large block, and SETTINGS are tried for all others.
 
         Raises:
             Infeasible: Two settings report that there is no solution.
             DesignFailed: No setting gives a result that can be verified.
         """
         attempts: list[_Attempt] = []
-        if settings is None:
-            settings = (INTERIOR,) if any(block.large for block in self.blocks) else SETTINGS
-        for each in settings:
-            x, attempt = self._attempt(each, accept)
+        for name in settings or ((INTERIOR,) if any(block.large for block in self.blocks) else SETTINGS):
+            x, attempt = self._attempt(name, accept)
             if attempt.reason is None:
                 return x
             attempts.append(attempt)
+            statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
             if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
-                break
-        statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
-        if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
-            raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
+                raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
         advice = "try shorter delays, a larger damping or a lower order; the error's `problem` is the convex problem"
         raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 
@@ -147,28 +139,23 @@ class ConeProgram:
         least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
         return float(-min(least, default=np.inf))
 
-    def _attempt(self, settings: _Settings, accept: Callable[[Array], bool] | None) -> tuple[Array, _Attempt]:
-        started = time.perf_counter()
-        x, status, reason = np.full(len(self.cost), np.nan), "panic", None
+    def _attempt(self, settings: str, accept: Callable[[Array], bool]) -> tuple[Array, _Attempt]:
+        reason = None
         try:
-            x, status = _interior(self) if settings is INTERIOR else _clarabel(self, settings.options)
+            x, status = _interior(self) if settings == INTERIOR else _clarabel(self, SETTINGS[settings])
         except BaseException as error:  # Clarabel's Rust panics are not Exceptions
             if type(error).__name__ != "PanicException":
                 raise
-            reason = str(error)
-        reason = reason or self._doubt(x, status, accept)
-        value = None if reason else float(self.cost @ x)
-        return x, _Attempt(settings.name, status, value, time.perf_counter() - started, reason)
-
-    def _doubt(self, x: Array, status: str, accept: Callable[[Array], bool] | None) -> str | None:
-        """Return the reason why x may not be used, or None."""
+            return np.full(len(self.cost), np.nan), _Attempt(settings, "panic", str(error))
         if status not in ("Solved", "AlmostSolved"):
-            return f"the solver reports {status}"
-        if not np.isfinite(x).all():
-            return "an unknown has no finite value"
-        if not (worst := self.violation(x)) <= _TOLERANCE:
-            return f"a constraint is violated by {worst:.1e}"
-        return None if accept is None or accept(x) else "the result does not pass the caller's verification"
+            reason = f"the solver reports {status}"
+        elif not np.isfinite(x).all():
+            reason = "an unknown has no finite value"
+        elif not (worst := self.violation(x)) <= _TOLERANCE:
+            reason = f"a constraint is violated by {worst:.1e}"
+        elif not accept(x):
+            reason = "the result does not pass the caller's verification"
+        return x, _Attempt(settings, status, reason)
 
 
 def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
@@ -247,7 +234,8 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
     problem = _stacked(problem)
     blocks, cost = problem.blocks, problem.cost
     x: Array = np.zeros(len(cost))
-    size: float = max(_largest(part) for block in blocks for part in (block.constant, block.slopes, cost))
+    parts = [cost, *(part for block in blocks for part in (block.constant, block.slopes))]
+    size: float = max(np.abs(part).max(initial=1.0) for part in parts)
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
     Z: _Parts = S
     best = x
@@ -337,7 +325,3 @@ def _adjoint(X: Any) -> Any:
 
 def _product(X: Any, Y: Any) -> float:
     return float(np.real(np.vdot(X, Y)))
-
-
-def _largest(part: Any) -> float:
-    return float(np.abs(part).max(initial=1.0))

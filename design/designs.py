@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -24,6 +25,8 @@ from haptic_loop.design.own import called, named
 from haptic_loop.design.result import ANY, Design, DesignFailed
 from haptic_loop.design.transparency import NO_FORCE, silent
 
+_Progress = Callable[[str, int, int], None]  # called with (task, steps done, number of steps)
+
 
 class _Kind(NamedTuple):
     conditions: tuple[Condition, ...]  # allowed conditions; `usual_condition` chooses the default
@@ -40,7 +43,7 @@ KINDS = {
     "spring-damper": _Kind(
         (THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY, ANY_ENVIRONMENT),
         "spring_damper",
-        "design_with",
+        "design",
         ("condition",),
         ("switching", "limiter", "band_hz"),
         limited=True,
@@ -49,7 +52,7 @@ KINDS = {
     "moving-average": _Kind(
         (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), for_less_damping=True
     ),
-    "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "diagonal")),
+    "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order",)),
     "optimal": _Kind(
         (THIS_ENVIRONMENT, KNOWN_DEVICE),
         "optimal",
@@ -102,7 +105,7 @@ def design_by_kind(
     loop: Loop,
     kind: str = "spring-damper",
     condition: str | Condition | None = None,
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    progress: _Progress = lambda what, done, total: None,
     **options: Any,
 ) -> Design:
     """Design and verify a coupling.
@@ -134,42 +137,51 @@ def design_by_kind(
     able = {c.name: c for c in chosen.conditions}
     if condition_name not in able:
         raise ValueError(f"condition is {condition_name!r}, for {kind} allowed are {', '.join(able)}")
-    made_for = able[condition_name]
+    started = time.perf_counter()
     if span := options.pop("switching", None):
         loop = loop.switching(DelayRange(*(tuple(map(int, end)) for end in span)))
-    if loop.levels and (reason := made_for.beyond(loop)):
-        raise ValueError(reason)
-    if loop.levels and (kind != "moving-average" or made_for is KNOWN_DEVICE_ANY):
-        return _in_principal_axes(loop, kind, own or made_for, progress, options)
-    if chosen.model and loop.environment.walls:
+    design = _designed(loop, kind, able[condition_name], own, progress, options)
+    return replace(design, wall_s=time.perf_counter() - started)
+
+
+def _designed(
+    loop: Loop, kind: str, condition: Condition, own: Condition | None, progress: _Progress, options: dict[str, Any]
+) -> Design:
+    """Return the design by `condition` for the user's condition `own` or, if that is None, for `condition`.
+
+    Raises the errors of `design_by_kind`.
+    """
+    chosen, beyond, walls = KINDS[kind], condition.beyond(loop), loop.environment.walls
+    if loop.levels and beyond:
+        raise ValueError(beyond)
+    if loop.levels and (kind != "moving-average" or condition is KNOWN_DEVICE_ANY):
+        return _in_principal_axes(loop, kind, own or condition, progress, options)
+    if chosen.model and walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")
     if chosen.model and options.get("limiter") and (reason := LIMITER.not_designed(loop)):
         with_less = {**options, "limiter": False, "bases": ((4, 3),)}
         raise ValueError(f"{reason}{_instead(loop, 'leaving out --limiter', kind, **with_less)}")
-    further = {"condition": made_for.name, "progress": progress}
-    further = {name: value for name, value in further.items() if name in chosen.takes}
-    make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
-
-    if loop.latency and (reason := made_for.beyond(loop)):
-        raise ValueError(f"latency: {reason.removeprefix('latency: ')}")
-    if loop.environment is RIGID_WALL and kind != "moving-average" and made_for is not KNOWN_DEVICE_ANY:
+    if loop.latency and beyond:
+        raise ValueError(f"latency: {beyond.removeprefix('latency: ')}")
+    if kind != "moving-average" and loop.environment is RIGID_WALL and condition is not KNOWN_DEVICE_ANY:
         other = (
             "use moving-average, spring-damper with known-device-any, or design.audit --rigid for the stiffest spring"
         )
         raise ValueError(f"environment: a rigid wall has no E(z) with which {kind} is designed; {other}")
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
+    further = {"condition": condition.name, "progress": progress}
+    further = {name: value for name, value in further.items() if name in chosen.takes}
+    make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
     if own:
-        return _of_own(_with_less_damping(loop, make, own, made_for), own)
-    anywhere = made_for.guarantee(loop) == ANY
-    if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
-        return _with_less_damping(loop, make, made_for)
-    # The search for gains by known-device allows constant delays only.
-    switched = loop.varying_delay and made_for is KNOWN_DEVICE
-    if chosen.model or anywhere or not (loop.latency or loop.environment.walls or loop.ranges or switched):
-        return make(loop)
-    return _with_less_damping(loop, make, made_for)
+        return _of_own(_with_less_damping(loop, make, own, condition), own)
+    if condition.guarantee(loop) == ANY:
+        uncovered = (loop.latency or loop.varying_delay) and kind != "moving-average"
+    else:  # The search for gains by known-device allows constant delays only.
+        switched = loop.varying_delay and condition is KNOWN_DEVICE
+        uncovered = not chosen.model and (loop.latency or walls or loop.ranges or switched)
+    return _with_less_damping(loop, make, condition) if uncovered else make(loop)
 
 
 def _of_own(design: Design, own: Condition) -> Design:
@@ -219,11 +231,7 @@ _ROUNDED = 1e-9  # share of the damping that covers the rounding of the eigenval
 
 
 def _in_principal_axes(
-    loop: Loop,
-    kind: str,
-    condition: Condition,
-    progress: Callable[[str, int, int], None],
-    options: dict[str, Any],
+    loop: Loop, kind: str, condition: Condition, progress: _Progress, options: dict[str, Any]
 ) -> Design:
     """Design in the principal axes of the damping matrices, turn the coupling back, and judge it by the full matrices.
 

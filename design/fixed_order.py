@@ -1,20 +1,19 @@
 """Design state-space couplings of a given order that satisfy Theorem 4 (`--coupling ccl`, Remark 5 of the paper).
 
-A descent from a spring-damper design minimises ||W1 L W2||_inf (23). Each step solves a convex problem whose solutions
+A descent from a spring-damper design minimises ||L W2||_inf (23). Each step solves a convex problem whose solutions
 all satisfy the condition. A refined sweep then checks Theorem 4. The cone complementarity algorithm of Remark 5 is not
 offered, because its bisection on mu stalls near its start.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator
+from itertools import islice
 
 import msgspec
 import numpy as np
 
-from haptic_loop.controller.arguments import of_kind, whole
+from haptic_loop.controller.arguments import whole
 from haptic_loop.controller.coupling import Compliance, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
@@ -64,18 +63,16 @@ class _Units:
 class _FixedOrder:
     """The couplings with `order` states per channel; the unknowns p are the free entries of A, B and V1.
 
-    phi (m,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay. If `diagonal`, V has no entries
-    between different channels.
+    V has no entries between different channels. phi (m,) [N s/m] is the multiplier for psi >= 1, or None for psi = 0.
     """
 
-    def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
+    def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1) -> None:
         self.shaping, self.order, self.units = shaping, order, _Units(shaping, phi)
         one, row = np.eye(shaping.loop.channels), np.eye(order)[:1]
         self.F = np.kron(one, row)  # F reads the first state of every channel.
         masks = [np.kron(one, np.ones((order, order))), np.kron(one, np.ones((order, 1))), one]
-        masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
         self._shapes = [mask.shape for mask in masks]
-        self._free = [np.nonzero(mask) for mask in (*masks[:2], np.triu(masks[2]))]
+        self._free = [np.nonzero(mask) for mask in masks]
 
     @property
     def unknowns(self) -> int:
@@ -88,7 +85,7 @@ class _FixedOrder:
         for matrix, free, values in zip(parts, self._free, np.split(p, ends), strict=True):
             matrix[free] = values
         A, B, V1 = parts
-        return Lti.with_rest(A, B, self.F, V1 + np.triu(V1, 1).T, 1.0)
+        return Lti.with_rest(A, B, self.F, V1, 1.0)
 
     def coupling(self, p: Array) -> Lti:
         return self.units.si(self.unit_coupling(p))
@@ -114,9 +111,9 @@ class _FixedOrder:
         return self.units.block(self.unit_coupling(p))
 
     def weighted_loop(self, p: Array) -> Lti:
-        """Return W1 L W2, affine in p."""
+        """Return L W2, affine in p."""
         shaping = self.shaping
-        return shaping.W1 @ (shaping.late + shaping.environment @ self.coupling(p)) @ shaping.W2
+        return (shaping.late + shaping.environment @ self.coupling(p)) @ shaping.W2
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -131,7 +128,7 @@ def _passivity_storage(family: _FixedOrder, p: Array) -> Array:
 
 
 def _gain_storage(family: _FixedOrder, p: Array, mu: float) -> Array:
-    """Return the U = X^-1 > 0 of Lemma 3 that proves ||W1 L W2||_inf < mu with the largest margin."""
+    """Return the U = X^-1 > 0 of Lemma 3 that proves ||L W2||_inf < mu with the largest margin."""
     G = family.weighted_loop(p) * (1 / mu)
     S = lmi.reachability_scaled(G)
     n, m = S.shape[0], G.inputs
@@ -157,32 +154,6 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
     return lmi.symmetric_from(ConeProgram(cost, blocks).solve(what)[:-1], n)
 
 
-class _Lemmas:
-    """Lemmas 2 and 3 for couplings near `at`, in coordinates with Q = U = I at `at`; mu is in units of `norm`."""
-
-    def __init__(self, family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
-        self.at, self.LQ, self.LU, self.norm = at, np.linalg.cholesky(Q), np.linalg.cholesky(U), norm
-        self._block = _affine(family.block, at, self.LQ)
-        self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
-
-    def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
-        """Return Lemmas 2 and 3 as inequalities in the unknowns v; `every` holds the indices of v.
-
-        `parts` splits v into p - at, Q, a lower bound of Q^-1, U, a lower bound of U^-1, and mu^2/norm^2.
-        """
-
-        def passivity(v: Array) -> Array:
-            p, Q, Y, *_ = parts(v)
-            A, B, C, D = self._block(p)
-            return lmi.lemma2(lmi.Ports(A, B, C, D, C, D), Q, Y, None, np.zeros_like(D))
-
-        def gain(v: Array) -> Array:
-            p, _, _, U, X, mu2 = parts(v)
-            return lmi.lemma3(*self._loop(p), X, U, mu2)
-
-        return [Inequality.of(passivity, every), Inequality.of(gain, every)]
-
-
 _System = tuple[Array, Array, Array, Array]  # A, B, C, D
 
 
@@ -205,7 +176,7 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 
 
 # ----------------------------------------------------------------------------------------------------
-# Fixed-order couplings by inner convex approximation: descent on ||W1 L W2||_inf in which every step is feasible.
+# Fixed-order couplings by inner convex approximation: descent on ||L W2||_inf in which every step is feasible.
 #
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
 # positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
@@ -214,52 +185,50 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # Q0 = I the tangent is 2I - Q.
 
 
-_Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu
 _SETTLED = 1e-4  # The descent ends after a step that improves the norm by less than this share.
 _FIRST_ROOM = 0.05  # The first storage U proves a norm that is larger than the initial norm by this share.
 _LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step from I; they keep 2I - Q, 2I - U positive
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
-    """Yield successive couplings from the strictly feasible p with the norm `norm`, until Q or U is singular."""
-    Q = np.linalg.inv(_passivity_storage(family, p))
-    U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
-    while not _singular(Q, U):
-        p, Q, U = _step(_Lemmas(family, p, Q, U, norm))
-        yield p
+    """Yield successive couplings from the strictly feasible p with the norm `norm`.
+
+    The descent ends when Q or U is singular, or when the solver's accuracy is exhausted.
+    """
+    try:
+        Q = np.linalg.inv(_passivity_storage(family, p))
+        U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
+        while min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) > 0:
+            p, Q, U = _step(family, p, Q, U, norm)
+            yield p
+    except DesignFailed:
+        return
 
 
-def _singular(Q: Array, U: Array) -> bool:
-    return min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) <= 0
+def _step(family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> tuple[Array, Array, Array]:
+    """Return p, Q and U of least mu near the coupling `at`, by one SDP with Lemmas 2 and 3.
 
-
-def _descended(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """Return the best coupling and the number of accepted steps, `budget` at most."""
-    steps, sdps = _descend(family, p, norm), 0
-    while sdps < budget:
-        try:
-            trial = next(steps, None)
-        except DesignFailed:
-            break  # The solver's accuracy is exhausted; the last good step is the result.
-        if trial is None or not holds(trial, norm):
-            break
-        before, norm, p = norm, family.shaping.norm(family.coupling(trial))[0], trial
-        sdps += 1
-        if before - norm < _SETTLED * norm:
-            break
-    return p, sdps
-
-
-def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
-    """Solve one SDP in (p - at, Q, U, mu^2/norm^2) for the least mu and return its p, Q and U."""
-    nq, nu = lemmas.LQ.shape[0], lemmas.LU.shape[0]
-    ends = np.cumsum([lemmas.at.size, lmi.packed(nq), lmi.packed(nu)])
+    The unknowns are p - at, Q, U and mu^2/norm^2, in coordinates in which Q = U = I at the coupling `at`.
+    """
+    LQ, LU = np.linalg.cholesky(Q), np.linalg.cholesky(U)
+    block = _affine(family.block, at, LQ)
+    loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, LU)
+    nq, nu = len(Q), len(U)
+    ends = np.cumsum([at.size, lmi.packed(nq), lmi.packed(nu)])
     every = range(ends[-1] + 1)
 
-    def parts(v: Array) -> Sequence[Any]:
-        p, q, u, t = np.split(v, ends)
-        Q, U = lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu)
-        return p, Q, 2 * np.eye(nq) - Q, U, 2 * np.eye(nu) - U, t[0]
+    def parts(v: Array) -> tuple[Array, Array, Array, float]:
+        p, q, u, mu2 = np.split(v, ends)
+        return p, lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu), mu2[0]
+
+    def passivity(v: Array) -> Array:
+        p, Q, _, _ = parts(v)
+        A, B, C, D = block(p)
+        return lmi.lemma2(lmi.Ports(A, B, C, D, C, D), Q, 2 * np.eye(nq) - Q, None, np.zeros_like(D))
+
+    def gain(v: Array) -> Array:
+        p, _, U, mu2 = parts(v)
+        return lmi.lemma3(*loop(p), 2 * np.eye(nu) - U, U, mu2)
 
     def bound(sign: int, value: float, first: int, n: int) -> Inequality:
         """Return sign (M - value I) >= 0 for the symmetric matrix M (n, n) whose first unknown is `first`."""
@@ -268,29 +237,23 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
 
     states = [(ends[0], nq), (ends[1], nu)]
     bounds = [bound(sign, value, *each) for sign, value in ((1, _LEAST), (-1, _MOST)) for each in states]
-    blocks = [*lemmas.inequalities(parts, every), *bounds]
+    blocks = [Inequality.of(passivity, every), Inequality.of(gain, every), *bounds]
     problem = ConeProgram(np.append(np.zeros(ends[-1]), 1.0), blocks)
-    p, Q, _, U, *_ = parts(problem.solve("a step of the inner convex approximation"))
-    return lemmas.at + p, lemmas.LQ @ Q @ lemmas.LQ.T, lemmas.LU @ U @ lemmas.LU.T
+    p, Q, U, _ = parts(problem.solve("a step of the inner convex approximation"))
+    return at + p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 
 _START_ROOM = 1e-3  # The start is designed for damping reduced by this share, so that it is strictly feasible.
 
 
-def design(
-    loop: Loop,
-    order: int = 1,
-    diagonal: bool = True,
-    most_sdps: int = budgets.FIXED_ORDER_PROBLEMS,
-) -> Design:
+def design(loop: Loop, order: int = 1, most_sdps: int = budgets.FIXED_ORDER_PROBLEMS) -> Design:
     """Design a coupling with `order` states per channel by a descent from strictly feasible spring-damper gains.
 
-    If `diagonal`, the coupling does not join channels. The descent has at most `most_sdps` steps. Raises Infeasible if
-    Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
+    The descent has at most `most_sdps` steps. Raises Infeasible if Theorem 4 admits no spring-damper to start from,
+    DesignFailed if no result is certified.
     """
     whole("order", order, 1, _MOST_STATES)
-    of_kind("diagonal", diagonal, bool, "True or False")
-    started, shaping, phi = time.perf_counter(), lmi.Shaping(loop), least_phi(loop)
+    shaping, phi = lmi.Shaping(loop), least_phi(loop)
     reserved = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
     first = spring_damper.design(reserved)
     gains = first.coupling
@@ -299,18 +262,19 @@ def design(
     def judged(V: Lti) -> Requirement:
         return ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
 
-    family = _FixedOrder(shaping, phi, order, diagonal)
-
-    def holds(p: Array, mu: float) -> bool:
-        """Return whether the coupling p is certified and ||W1 L W2||_inf <= mu, judged from the coupling alone."""
-        V = family.coupling(p)
-        return V.is_stable() and judged(V).certified and shaping.norm(V)[0] <= mu
-
-    p = family.start(gains)
-    p, sdps = _descended(family, p, shaping.norm(family.coupling(p))[0], holds, most_sdps)
-    V = family.coupling(p)
+    family = _FixedOrder(shaping, phi, order)
+    start, sdps = family.start(gains), first.sdps
+    V = family.coupling(start)
+    norm = shaping.norm(V)[0]
+    for trial in islice(_descend(family, start, norm), most_sdps):
+        better = family.coupling(trial)
+        before, reached = norm, shaping.norm(better)[0]
+        if not (better.is_stable() and judged(better).certified and reached <= norm):
+            break
+        V, norm, sdps = better, reached, sdps + 1
+        if before - norm < _SETTLED * norm:
+            break
     requirement = judged(V)
     if not requirement.certified:
         raise DesignFailed(None, (), "the descent gave no coupling that Theorem 4 certifies")
-    norm, wall_s = shaping.norm(V)[0], time.perf_counter() - started
-    return Design(Compliance(V), "any-environment", "loop-norm", norm, requirement, first.sdps + sdps, wall_s, phi=phi)
+    return Design(Compliance(V), "any-environment", "loop-norm", norm, requirement, sdps, phi=phi)

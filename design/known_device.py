@@ -595,7 +595,8 @@ class _Search:
             blocks.append(Inequality.of(lambda y, root=root: np.diag([y[1], 1.0]) + y[0] * root, [i, last]))
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
         # The minimum cannot exceed `least`, because the point with that share satisfies all tangents.
-        settings = (SETTINGS[0], INTERIOR, *SETTINGS[1:])
+        first, *others = SETTINGS
+        settings = (first, INTERIOR, *others)
         x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, settings)
         slack = np.linalg.eigvalsh(blocks[0].at(x))[:, 0]
         self.tangents = [one for one, left in zip(self.tangents, slack, strict=True) if left < _SLACK]

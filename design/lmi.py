@@ -40,59 +40,42 @@ def _low_pass(channels: int, T: float) -> Lti:
     return Lti(pole * one, one, gain * pole * one, gain * one, T)
 
 
-def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
-    if W1.inputs != channels or (W2.inputs, W2.outputs) != (channels, channels):
-        raise ValueError(f"W1 and W2 must fit the {channels} channels: W1 in its inputs, W2 in its inputs and outputs")
-    for name, W in (("W1", W1), ("W2", W2)):
-        if not W.is_stable():
-            raise ValueError(f"{name} has a pole on or outside the unit circle, so no norm is finite")
-    z = on_circle(np.array([0.1, 1.0, 3.0]))
-    response = W2.at(z)
-    if np.abs(response - response * np.eye(channels)).max() > 1e-9 * np.abs(response).max():
-        raise ValueError("W2 must be diagonal, so that it commutes with the diagonal gains in the convex-concave step")
-
-
 # ----------------------------------------------------------------------------------------------------
-# The loop-shaping objective of section 5 of the paper: ||W1 L W2||_inf with L = I + Psi E V - Psi Lambda^-1 Theta.
+# The loop-shaping objective of section 5 of the paper: ||L W2||_inf with L = I + Psi E V - Psi Lambda^-1 Theta. The
+# paper's further weight W1 is the identity.
 
 
 class Shaping:
-    """The weighted L (22) of a loop, W1 L W2, for fast evaluation with many couplings.
+    """The weighted L (22) of a loop, L W2, for fast evaluation with many couplings.
 
-    The defaults of W1 and W2 are the identity and `_low_pass`. Raises ValueError for weights of wrong size, unstable
-    weights, a W2 that is not diagonal, and an active environment.
+    W2 is `_low_pass`. Raises ValueError for an active environment.
     """
 
-    def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
+    def __init__(self, loop: Loop) -> None:
         N, T, E = loop.channels, loop.T, loop.E()
-        one = Lti.constant(np.eye(N), T)
-        self.loop, self.usable = loop, usable(loop)
-        self.W1, self.W2 = W1 or one, W2 or _low_pass(N, T)
-        _check_weights(self.W1, self.W2, N)
+        self.loop, self.usable, self.W2 = loop, usable(loop), _low_pass(N, T)
         if reason := loop.environment.active(T):
             raise ValueError(reason)
         advance = [t + p - n for t, p, n in zip(loop.theta, loop.psi, loop.lam, strict=True)]
-        self.late = one - delay(advance, T)  # I - Psi Lambda^-1 Theta
+        self.late = Lti.constant(np.eye(N), T) - delay(advance, T)  # I - Psi Lambda^-1 Theta
         self.environment = delay(loop.psi, T) @ E  # Psi E
 
     def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
-        """Return W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
+        """Return Psi E, W2 and I - Psi Lambda^-1 Theta at exp(jw), each (k, m, m)."""
         z = on_circle(w)
-        W1 = self.W1.at(z)
-        return W1 @ self.environment.at(z), self.W2.at(z), W1 @ self.late.at(z)
+        return self.environment.at(z), self.W2.at(z), self.late.at(z)
 
     def grid(self, *systems: Lti) -> Array:
-        """Return frequencies [rad/sample] from 0 to pi that resolve every pole of E, the weights and `systems`."""
-        known = (self.environment, self.W1, self.W2, *systems)
-        return np.concatenate([[0.0], frequencies(*known)])
+        """Return frequencies [rad/sample] from 0 to pi that resolve every pole of E, W2 and `systems`."""
+        return np.concatenate([[0.0], frequencies(self.environment, self.W2, *systems)])
 
     def gain(self, V: Lti, w: Array) -> Array:
-        """Return sigma_max of W1 L W2 at exp(jw), shape (k,)."""
-        left, right, late = self.parts(w)
-        return np.linalg.norm((left @ V.at(on_circle(w)) + late) @ right, 2, axis=(1, 2))
+        """Return sigma_max of L W2 at exp(jw), shape (k,)."""
+        environment, weight, late = self.parts(w)
+        return np.linalg.norm((environment @ V.at(on_circle(w)) + late) @ weight, 2, axis=(1, 2))
 
     def norm(self, V: Lti) -> tuple[float, float]:
-        """Return (||W1 L W2||_inf, its frequency [rad/sample])."""
+        """Return (||L W2||_inf, its frequency [rad/sample])."""
         return supremum(lambda w: self.gain(V, w), self.grid(V))
 
 

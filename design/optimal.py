@@ -531,7 +531,7 @@ class _Search:
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
-            gains = design_spring_damper(self.loop, "this-environment").coupling
+            gains = design_spring_damper(self.loop, "this-environment", limiter=False).coupling
             return self._proved(self._assessed(gains, np.nan), None)
         except (DesignFailed, ValueError):
             return None

@@ -7,8 +7,7 @@ design.gain_search.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +46,7 @@ from haptic_loop.design.lmi import (
     symmetric_from,
     usable,
 )
-from haptic_loop.design.result import Design, DesignFailed, Infeasible
+from haptic_loop.design.result import Design, DesignFailed, Infeasible, Requirement
 from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 
 # ----------------------------------------------------------------------------------------------------
@@ -151,54 +150,39 @@ class _GainSet:
         raise DesignFailed(None, (), line)
 
 
-def _gain_block(
-    unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
-) -> Inequality:
-    """Return the inequality [[base, rows*], [rows, t I]] >= 0, where t is the last of the unknowns.
-
-    rows (k, p, m) has slopes (q, k, p, m), and base (k, m, m) has slopes (q, k, m, m). If base >= 0, the inequality
-    means rows* rows <= t base.
-    """
-    q, k, p, m = row_slopes.shape
-    constant = np.zeros((k, m + p, m + p), dtype=np.complex128)
-    slopes = np.zeros((q + 1, k, m + p, m + p), dtype=np.complex128)
-    for target, top, low in ((constant, base, rows), (slopes[:q], base_slopes, row_slopes)):
-        target[..., :m, :m] = top
-        target[..., m:, :m] = low
-        target[..., :m, m:] = np.conj(np.swapaxes(low, -1, -2))
-    slopes[q, :, m:, m:] = np.eye(p)
-    return Inequality(constant, slopes, unknowns)
-
-
 # ----------------------------------------------------------------------------------------------------
-# One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains (docs/theory.md). With
-# g = k + b (1 - 1/z) per channel the norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. A step
-# replaces g* g by its tangent at the previous gains, which lies below g* g, so that no step increases the norm.
+# One step of the convex-concave sequence for ||L W2||_inf (23) over spring-damper gains (docs/theory.md). With
+# g = k + b (1 - 1/z) per channel the norm is at most mu iff (L g W2)* (L g W2) <= mu^2 g* g on |z| = 1. A step replaces
+# g* g by its tangent at the previous gains, which lies below g* g, so that no step increases the norm.
 
 
-def step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
+def _step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """Return (gains, bound on the norm at the frequencies w) after one convex-concave step from the gains `at`."""
     cost = np.append(np.zeros(at.size), 1.0)
-    cuts = _tangent(shaping, at, norm, w)
-    x = gains.solve(cost, "a step of the convex sequence", [cuts])
+    x = gains.solve(cost, "a step of the convex sequence", [_tangent(shaping, at, norm, w)])
     return x[:-1], norm * float(np.sqrt(x[-1]))
 
 
 def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
-    """Return [[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled; t is the last variable."""
+    """Return [[g0* g + g* g0 - g0* g0, (L g W2)*], [L g W2, t norm^2 I]] >= 0, scaled; t is the last unknown."""
     N = shaping.loop.channels
-    left, right, late = shaping.parts(w)
+    environment, weight, late = shaping.parts(w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
     g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # slopes of g: diagonals (2N, k, N)
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
-    # Each column is divided by its |g0|. The blocks with W1 L g W2 are also divided by the norm.
+    # Each column is divided by its |g0|. The blocks with L g W2 are also divided by the norm.
     scale = 1 / np.abs(g0)
-    rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
-    row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
-    tangent = 2 * (np.conj(g0) * g).real * scale**2
-    diagonal = np.eye(N)
-    base = -np.broadcast_to(diagonal, (w.size, N, N)).astype(np.complex128)
-    return _gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
+    rows = (environment * (shaping.loop.T / shaping.usable)) @ weight * scale[:, None, :] / norm
+    row_slopes = (late * g[:, :, None, :]) @ weight * scale[:, None, :] / norm
+    base_slopes = (2 * (np.conj(g0) * g).real * scale**2)[..., None] * np.eye(N)
+    constant = np.zeros((w.size, 2 * N, 2 * N), dtype=np.complex128)
+    slopes = np.zeros((2 * N + 1, *constant.shape), dtype=np.complex128)
+    for target, top, low in ((constant, -np.eye(N), rows), (slopes[:-1], base_slopes, row_slopes)):
+        target[..., :N, :N] = top
+        target[..., N:, :N] = low
+        target[..., :N, N:] = np.conj(np.swapaxes(low, -1, -2))
+    slopes[-1, :, N:, N:] = np.eye(N)
+    return Inequality(constant, slopes, range(2 * N + 1))
 
 
 _SETTLED = 1e-6  # The sequence ends if a step changes the norm by a smaller share, and its bound is as near.
@@ -208,46 +192,45 @@ _NEGLIGIBLE = 1e-6  # Dampers below this share of the usable damping become 0, b
 def design(
     loop: Loop,
     condition: str = "any-environment",
-    starts: Sequence[SpringDamper] = (),
-    limiter: bool | None = False,
+    limiter: bool | None = None,
     band_hz: tuple[float, float] | None = None,
-    W1: Lti | None = None,
-    W2: Lti | None = None,
 ) -> Design:
     """Return the spring-damper of least objective that `condition` certifies.
 
-    any-environment reduces ||W1 L W2||_inf (23) over the exact set of gains (for psi >= 1, the set for one Phi) until
-    the norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is
-    reached from the starts, or with more than FEW channels the first minimum found. known-device-any maximises the sum
-    of K.
+    any-environment reduces ||L W2||_inf (23) over the exact set of gains (for psi >= 1, the set for one Phi) until the
+    norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is reached
+    from several starts, or with more than FEW channels the first minimum found. known-device-any maximises the sum of
+    K.
 
     Args:
-        loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
+        loop: The devices, their delays and the environment. Only this-environment allows delays that switch.
         condition: The name of a condition.
-        starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
-            any-environment uses only the first, known-device-any none.
         limiter: Whether the design must cover limited forces, too (None: if possible); any-environment does if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
-        W1, W2: The weights of output and input of (23).
 
     Raises:
         Infeasible: Theorem 4 admits no gains.
-        DesignFailed: No gains were found, or any-environment or known-device-any does not certify them.
-        ValueError: No design of the condition exists for the limiter, for varying delays, or for another argument.
+        DesignFailed: No gains were found, any-environment or known-device does not certify them, or the loop has so
+            many channels that the search would take minutes.
+        ValueError: No design of the condition exists for the limiter or for another argument.
     """
-    if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
-        if loop.varying_delay or limiter:
-            raise ValueError(f"{condition}: no spring-dampers are designed for limited forces or delays that vary")
-        return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
-    if named(condition).extensible:
-        if loop.varying_delay and limiter:
-            raise ValueError("limiter: gains for limited forces are designed for constant delays only; leave it out")
-        return _for_this_environment(loop, starts, limiter, band_hz)
-    if loop.varying_delay:
-        raise ValueError(
-            "delays that vary: this function covers this-environment only; use design_coupling for other conditions"
-        )
-    return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
+    chosen = named(condition)
+    if chosen.extensible:
+        if limiter:
+            _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
+            if refusal := LIMITER.not_designed(loop):
+                raise ValueError(refusal)
+        elif loop.channels > _MOST_LIMITED or LIMITER.not_designed(loop):
+            limiter = False
+        return _for_this_environment(loop, limiter, band_hz)
+    if limiter and chosen is KNOWN_DEVICE:
+        raise ValueError("limiter: known-device spring-dampers are not for limited forces; use this-environment")
+    _require_few(
+        loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
+    )
+    if chosen is KNOWN_DEVICE:
+        return _for_known_devices(loop, band_hz)
+    return _stiffest_known(loop) if chosen is KNOWN_DEVICE_ANY else _for_any_environment(loop)
 
 
 #: Number of significant digits of the gains in loops of more than FEW channels, because exact proofs with all digits
@@ -262,38 +245,19 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
         raise DesignFailed(None, (), f"{loop.channels} channels, allowed are {most} for a spring-damper by {what}")
 
 
-def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """Return a spring-damper (`design`) that covers limited forces for `limiter` True, does not for False.
-
-    For None it covers them if possible. Raises the errors of `design`, and DesignFailed at once if the loop has so many
-    channels that the search would take minutes.
-    """
-    if not named(condition).extensible:  # With psi = 0 any-environment covers limited forces.
-        if limiter and named(condition) is KNOWN_DEVICE:
-            raise ValueError("limiter: known-device spring-dampers are not for limited forces; use this-environment")
-        _require_few(
-            loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
-        )
-        return design(loop, condition, **options)
-    if limiter:
-        _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
-    if limiter is False or loop.channels > _MOST_LIMITED:
-        return design(loop, condition, **options)
-    refusal = LIMITER.not_designed(loop)
-    if limiter and refusal:
-        raise ValueError(refusal)
-    return design(loop, condition, limiter=False if refusal else limiter, **options)
-
-
-def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
-    started, loop = time.perf_counter(), shaping.loop
-    phi = least_phi(loop)
+def _for_any_environment(loop: Loop) -> Design:
+    shaping, phi = Shaping(loop), least_phi(loop)
     certified = _GainSet(loop, phi)
-    gains, sdps = _start(loop, certified, start), 1
+    try:
+        gains = certified.solve(np.repeat([-1.0, 0.0], loop.channels), "the set of gains")
+    except Infeasible as error:
+        line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
+        raise Infeasible(error.problem, error.results, line) from error
+    sdps = 1
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
     for _ in range(budgets.SEQUENCE_STEPS):
-        gains, bound = step(shaping, certified, gains, norm, np.array(frequencies))
+        gains, bound = _step(shaping, certified, gains, norm, np.array(frequencies))
         sdps += 1
         before, (norm, peak) = norm, shaping.norm(_coupling(loop, gains).compliance(loop.T))
         frequencies.append(peak)
@@ -302,23 +266,26 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     coupling = _short(_coupling(loop, gains))
     if loop.channels > FEW:
         norm, _ = shaping.norm(coupling.compliance(loop.T))
-    return _verified(loop, coupling, phi, "loop-norm", norm, sdps, started)
+    return _verified(ANY_ENVIRONMENT.required(loop, coupling, phi), coupling, "loop-norm", norm, sdps, phi)
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
     """Return the coupling, with gains rounded to _DIGITS digits if it has more than FEW channels (faster proofs)."""
     if coupling.K.size <= FEW:
         return coupling
-    K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
-    return SpringDamper(K, B)
+    return SpringDamper(_rounded(coupling.K, _DIGITS), _rounded(coupling.B, _DIGITS))
 
 
-def _for_this_environment(
-    loop: Loop,
-    starts: Sequence[SpringDamper],
-    limiter: bool | None,
-    band_hz: tuple[float, float] | None,
-) -> Design:
+def _rounded(values: Iterable[float], digits: int) -> list[float]:
+    return [float(f"{value:.{digits}g}") for value in values]
+
+
+def _without_negligible(loop: Loop, coupling: SpringDamper) -> SpringDamper:
+    """Return the coupling without negligible dampers, rounded by `_short`."""
+    return _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
+
+
+def _for_this_environment(loop: Loop, limiter: bool | None, band_hz: tuple[float, float] | None) -> Design:
     """Return the spring-damper of least rms mismatch that this-environment certifies.
 
     If `limiter` is not False, it covers limited forces, or with None those below the limits if no such gains are found.
@@ -326,9 +293,7 @@ def _for_this_environment(
     each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
     if reason := budgets.too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
         raise DesignFailed(None, (), reason)
-    started, starts = time.perf_counter(), starts or _default_starts(loop)
-    band = band_hz or BAND_HZ
-    span = loop.varying_delay
+    starts, band, span = _starts(loop), band_hz or BAND_HZ, loop.varying_delay
     if band_hz and span:
         raise ValueError("band_hz: designs for delays that vary use 0.5 to 80 Hz; leave out band_hz")
     sampled = SwitchingLoop(loop) if span else SampledLoop(loop, band)
@@ -349,18 +314,19 @@ def _for_this_environment(
             certifies += f" under any switching from {span.lo} to {span.hi} samples"
         if limiter and (many or linear.gains):
             certifies += " while forces are limited"
-        line = (
-            f"no spring-damper was found that {certifies} for theta = {loop.theta}, psi = {loop.psi}, "
-            f"delta = {loop.delta}"
-        )
-        raise DesignFailed(None, (), line)
-    K, B, rms = best.gains.K, best.gains.B, best.rms
-    coupling = _short(SpringDamper(K, np.where(_NEGLIGIBLE * usable(loop) > B, 0.0, B)))
+        raise _no_gains(loop, certifies)
+    coupling, rms = _without_negligible(loop, best.gains), best.rms
+    F = loop.F(coupling)
     if many:
-        rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band)
-    requirement = this_environment(loop.F(coupling), loop)
-    wall_s = time.perf_counter() - started
-    return Design(coupling, "this-environment", "rms", rms, requirement, best.searches, wall_s, c=best.multiplier)
+        rms = rms_mismatch(F, loop.E(), loop.lam, band)
+    requirement = this_environment(F, loop)
+    return Design(coupling, "this-environment", "rms", rms, requirement, best.searches, c=best.multiplier)
+
+
+def _no_gains(loop: Loop, certifies: str) -> DesignFailed:
+    """Return the error of a search without result; `certifies` names the condition, with a verb."""
+    which = f"theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
+    return DesignFailed(None, (), f"no spring-damper was found that {certifies} for {which}")
 
 
 def _limited(
@@ -388,7 +354,7 @@ def _limited(
     return linear, best._replace(searches=linear.searches + best.searches)
 
 
-def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
+def _for_known_devices(loop: Loop, band_hz: tuple[float, float] | None) -> Design:
     """Return the spring-damper of least rms mismatch that known-device certifies.
 
     The search also starts from the result for this-environment, which is returned unless a better one is found. Raises
@@ -396,23 +362,21 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
-    started, band = time.perf_counter(), band_hz or BAND_HZ
-    plain = least_rms(SampledLoop(loop, band), starts or _default_starts(loop), band)
+    starts, band = _starts(loop), band_hz or BAND_HZ
+    plain = least_rms(SampledLoop(loop, band), starts, band)
     first = [plain.gains] if plain.gains else []
-    coupling, rms, searches, _ = least_rms(
-        KnownDeviceLoop(loop, band), [*first, *(starts or _default_starts(loop))], band
-    )
-    searches += plain.searches
-    if plain.gains and not rms < plain.rms:
-        coupling, rms = plain.gains, plain.rms
-    if coupling is None:
-        line = f"no spring-damper was found that {KNOWN_DEVICE.name} certifies for theta = {loop.theta}"
-        raise DesignFailed(None, (), f"{line}, psi = {loop.psi}, delta = {loop.delta}")
-    coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
-    requirement, wall_s = KNOWN_DEVICE.judge(loop, coupling), time.perf_counter() - started
+    best = least_rms(KnownDeviceLoop(loop, band), [*first, *starts], band)
+    searches = best.searches + plain.searches
+    if plain.gains and not best.rms < plain.rms:
+        best = plain
+    if best.gains is None:
+        raise _no_gains(loop, f"{KNOWN_DEVICE.name} certifies")
+    coupling = _without_negligible(loop, best.gains)
     beside = f"{decibels(plain.rms):z.2f} dB rms" if plain.gains else "no spring-damper"
-    note = f"known-device, {decibels(rms):z.2f} dB rms; this-environment, for devices of which less is known: {beside}"
-    return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
+    here = f"known-device, {decibels(best.rms):z.2f} dB rms"
+    note = f"{here}; this-environment, for devices of which less is known: {beside}"
+    requirement = KNOWN_DEVICE.judge(loop, coupling)
+    return Design(coupling, KNOWN_DEVICE.name, "rms", best.rms, requirement, searches, notes=(note,))
 
 
 _ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried beta/(largest beta)
@@ -441,17 +405,24 @@ def _stiffest_known(loop: Loop) -> Design:
     """
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
-    started, gains = time.perf_counter(), []
-    for own in loop.devices:
-        gains += _stiffest_device([loop.channel(i) for i in range(own.start, own.stop)])
-    K, B = zip(*gains, strict=True)
-    coupling = SpringDamper(K, B)
-    requirement = KNOWN_DEVICE_ANY.judge(loop, coupling)
-    if not requirement.certified:
-        why = requirement.shortfall
-        raise DesignFailed(None, (), f"the designed coupling is not certified by {KNOWN_DEVICE_ANY.name}: {why}")
-    wall_s = time.perf_counter() - started
-    return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", float(sum(K)), requirement, 0, wall_s)
+    K, B = zip(*(gains for own in loop.devices for gains in _stiffest_device(_axes(loop, own))), strict=True)
+    coupling = SpringDamper(_rounded(K, _STIFF_DIGITS), _rounded(B, _STIFF_DIGITS))
+    return _verified(KNOWN_DEVICE_ANY.judge(loop, coupling), coupling, "stiffness", float(sum(coupling.K)))
+
+
+def _axes(loop: Loop, own: slice) -> list[Loop]:
+    """Return the loop of each axis of the device with the channels `own`."""
+    return [loop.channel(i) for i in range(own.start, own.stop)]
+
+
+def _best_eta(cost: Callable[[float], float], tolerance: float) -> float:
+    """Return the share of the largest beta with the least cost, from _ETAS and a search between its best neighbours."""
+    from scipy.optimize import minimize_scalar  # slow to load
+
+    best = int(np.argmin([cost(eta) for eta in _ETAS]))
+    ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
+    optimum: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": tolerance})
+    return min(float(optimum.x), float(_ETAS[best]), key=cost)
 
 
 def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
@@ -487,12 +458,7 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
             gains.append((-float(best.fun), float(best.x)))
         return -sum(K for K, _ in gains), gains
 
-    tried = [at(eta) for eta in _ETAS]
-    best = int(np.argmin([value for value, _ in tried]))
-    ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-    optimum: Any = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6})
-    _, gains = min(at(float(optimum.x)), tried[best])
-    return [(float(f"{K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")) for K, B in gains]
+    return at(_best_eta(lambda eta: at(eta)[0], 1e-6))[1]
 
 
 def _limits(axes: Sequence[Loop], eta: float, z: Complex, reserve: float) -> list[Array]:
@@ -509,42 +475,42 @@ _SLACK = 2e-4  # constant above chi, relative to the largest chi; truncation may
 def _stiffest_linear(loop: Loop) -> Design:
     """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum of 1/V_i(1) [N/m].
 
-    With the Fourier coefficients chi_k of chi and V(1) = 2 chi_0, V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has
-    He[V/(1-z)] = chi. A small constant is added, and the series is cut off where the omitted terms sum to less than
-    half of this constant.
+    The coupling follows from the Fourier coefficients of chi (`_from_chi`). A small constant is added, and the series
+    is cut off where the omitted terms sum to less than half of this constant.
     """
-    from scipy.optimize import minimize_scalar  # slow to load
-
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
-    started, channels, each = time.perf_counter(), [], list[Array]()
+    channels, each = [], list[Array]()
     z = on_circle(np.linspace(0, 2 * np.pi, _TAPS, endpoint=False))
     for own in loop.devices:
-        axes = [loop.channel(i) for i in range(own.start, own.stop)]
+        axes = _axes(loop, own)
 
         def needed(eta: float, axes: Sequence[Loop] = axes) -> float:
             return sum(limits.mean() for limits in _limits(axes, eta, z, RESERVE))
 
-        best = int(np.argmin([needed(eta) for eta in _ETAS]))
-        ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-        optimum: Any = minimize_scalar(needed, bounds=ends, method="bounded")
-        each += _limits(axes, float(optimum.x), z, RESERVE)
+        each += _limits(axes, _best_eta(needed, 1e-5), z, RESERVE)
     for limits in each:
         series = np.fft.rfft(limits).real / _TAPS
         left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # bounds on the sum of each term and all later ones
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
-        coefficients = series[1:count]
-        weights = -2 * np.diff(np.append(coefficients, 0.0), prepend=0.0)
-        weights[0] += 2 * series[0] + 2 * _SLACK * limits.max()
-        channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
-    V = Lti.diag(*channels)
-    coupling = Compliance(V)
-    requirement = KNOWN_DEVICE_ANY.judge(loop, coupling)
-    if not requirement.certified:
-        why = requirement.shortfall
-        raise DesignFailed(None, (), f"the designed coupling is not certified by {KNOWN_DEVICE_ANY.name}: {why}")
-    stiffness, wall_s = float((1 / np.diag(V.dc())).sum()), time.perf_counter() - started
-    return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", stiffness, requirement, 0, wall_s)
+        channels.append(_from_chi(series[:count], 2 * _SLACK * limits.max(), loop.T))
+    coupling = Compliance(Lti.diag(*channels))
+    return _verified(KNOWN_DEVICE_ANY.judge(loop, coupling), coupling, "stiffness", _stiffness(coupling))
+
+
+def _from_chi(chi: Array, extra: float, T: float) -> Lti:
+    """Return V, with coefficients in decimals, such that He[V/(1-z)] = chi + extra/2, from the coefficients chi_k.
+
+    V is V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k with V(1) = 2 chi_0 + extra.
+    """
+    weights = -2 * np.diff(np.append(chi, 0.0))
+    weights[0] += extra
+    return taps(_rounded(weights, _TAP_DIGITS), T)
+
+
+def _stiffness(coupling: Compliance) -> float:
+    """Return the sum of the channels' static stiffnesses [N/m]."""
+    return float(np.trace(np.linalg.inv(coupling.V.dc())))
 
 
 _TAP_DIGITS = 12  # digits of a coefficient; the rounding error is far below _SLACK
@@ -552,7 +518,7 @@ _STIFF_RESERVE = 1e-3  # unused share of the damping, for rounded gains and freq
 _STIFF_DIGITS = 6  # digits of a gain
 
 
-def _default_starts(loop: Loop) -> list[SpringDamper]:
+def _starts(loop: Loop) -> list[SpringDamper]:
     """Return couplings from which a search starts, with 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
 
     d is the usable damping [N s/m]. With delay in the environment a further start is stiffer than the environment at
@@ -590,40 +556,42 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
         return _stiffest_linear(loop)
     if (loop.latency or loop.varying_delay) and not ANY_ENVIRONMENT.beyond(loop):
         return _stiffest_in_frame(loop)
-    started = time.perf_counter()
-    phi = least_phi(loop)
-    if loop.levels:
-        return _moving_average_of_levels(loop, started)
-    weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
-    coupling = MovingAverage(weight, terms.tolist(), _spare(loop) * terms**2 * weight)
-    return _verified(loop, coupling, phi, "stiffness", float(coupling.stiffness.sum()), 0, started)
+    phi, terms = least_phi(loop), np.array(loop.theta) + 1
+    if loop.levels:  # V = T/2 Delta^-1 (1 + .. + z^-theta)
+        weight = _rounded_inverse(2 * even_level(loop) / loop.T)
+        late, constant = moving_sum(loop.theta, loop.T), _spare(loop) * terms**2 * weight
+        coupling = Compliance(
+            Lti(late.A, late.B, weight @ late.C, weight @ late.D + (constant + constant.T) / 2, loop.T)
+        )
+        stiffness = _stiffness(coupling)
+    else:
+        weight = loop.T / (2 * even_damping(loop))
+        coupling = MovingAverage(weight, terms.tolist(), _spare(loop) * terms**2 * weight)
+        stiffness = float(coupling.stiffness.sum())
+    return _verified(ANY_ENVIRONMENT.required(loop, coupling, phi), coupling, "stiffness", stiffness, phi=phi)
 
 
 def _stiffest_in_frame(loop: Loop) -> Design:
     """Return the stiffest linear coupling of a loop with a latency or switching delays, for any environment.
 
-    The least admissible He[V/(1-z)], chi (docs/theory.md), is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k,
-    whose series is finite. V(1)/2 is the mean of chi, and the multiplier minimises this mean.
+    The coupling follows from the least admissible He[V/(1-z)], chi (docs/theory.md), which has finitely many
+    coefficients. V(1)/2 is the mean of chi, and the multiplier minimises this mean.
     """
     if loop.latency and loop.varying_delay:
         line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
         raise DesignFailed(None, (), line)
-    started, channels = time.perf_counter(), []
-    chi, unit = _late_chi if loop.latency else _switched_chi, (1.0,) * loop.channels
-    for i, delta in enumerate(unit if loop.levels else loop.delta):
-        terms = chi(loop, i, delta)
-        weights = 2 * -np.diff(np.append(terms, 0.0))
-        weights[0] += 2 * RESERVE * terms[0]
-        channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
-    V = Lti.diag(*channels)
+    chi = _late_chi if loop.latency else _switched_chi
+    each = [chi(loop, i, delta) for i, delta in enumerate((1.0,) * loop.channels if loop.levels else loop.delta)]
+    V = Lti.diag(*(_from_chi(terms, 2 * RESERVE * terms[0], loop.T) for terms in each))
     if loop.levels:  # chi of a device is that of one N s/m times Delta_i^-1
         V = _rounded_inverse(loop.Delta()) @ V
-    return _verified(loop, Compliance(V), None, "stiffness", float(np.trace(np.linalg.inv(V.dc()))), 0, started)
+    coupling = Compliance(V)
+    return _verified(ANY_ENVIRONMENT.required(loop, coupling), coupling, "stiffness", _stiffness(coupling))
 
 
 def _rounded_inverse(level: Array) -> Array:
     inverse = np.linalg.inv(level)
-    return np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverse + inverse.T) / 2])
+    return np.array([_rounded(row, _TAP_DIGITS) for row in (inverse + inverse.T) / 2])
 
 
 def _late_chi(loop: Loop, i: int, delta: float) -> Array:
@@ -683,50 +651,17 @@ def _best_latency_multiplier(loop: Loop, i: int, theta: int) -> Array:
 _Q = "q11", "q12", "q22"
 
 
-def _moving_average_of_levels(loop: Loop, started: float) -> Design:
-    """Return the stiffest linear coupling for matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta) with a reserve."""
-    weight = _rounded_inverse(2 * even_level(loop) / loop.T)
-    terms = np.array(loop.theta) + 1
-    late = moving_sum(loop.theta, loop.T)
-    constant = _spare(loop) * terms**2 * weight
-    V = Lti(late.A, late.B, weight @ late.C, weight @ late.D + (constant + constant.T) / 2, loop.T)
-    stiffness = float(np.trace(np.linalg.inv(V.dc())))
-    return _verified(loop, Compliance(V), least_phi(loop), "stiffness", stiffness, 0, started)
-
-
 def _verified(
-    loop: Loop, coupling: Coupling, phi: Array | None, figure: str, objective: float, sdps: int, started: float
+    requirement: Requirement, coupling: Coupling, figure: str, objective: float, sdps: int = 0, phi: Array | None = None
 ) -> Design:
-    """Return the design with the requirement of Theorem 4. Raises DesignFailed unless it is certified."""
-    requirement = ANY_ENVIRONMENT.required(loop, coupling, phi)
+    """Return the design for the condition of the requirement. Raises DesignFailed unless it is certified."""
+    name = requirement.condition
     if not requirement.certified:
-        why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
-        raise DesignFailed(None, (), f"the designed coupling is not certified by any-environment: {why}")
-    wall_s = time.perf_counter() - started
-    return Design(coupling, "any-environment", figure, objective, requirement, sdps, wall_s, phi=phi)
+        line = f"the designed coupling is not certified by {name}: {requirement.shortfall}"
+        raise DesignFailed(None, (), line)
+    return Design(coupling, name, figure, objective, requirement, sdps, phi=phi)
 
 
 def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     (k, b), spend = np.split(np.maximum(gains, 0.0), 2), usable(loop)
     return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
-
-
-def _start(loop: Loop, certified: _GainSet, start: SpringDamper | None) -> Array:
-    """Return the gains of the set nearest to `start`; without `start` those with the largest sum of k."""
-    N, more = loop.channels, []
-    cost = np.repeat([-1.0, 0.0], N)
-    if start is not None:  # minimise t with |gains - target| <= t
-        target = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
-        cost = np.append(np.zeros(2 * N), 1.0)
-
-        def near(x: Array) -> Array:
-            away = (x[:-1] - target)[:, None]
-            return np.block([[x[-1] * np.eye(2 * N), away], [away.T, x[-1:, None]]])
-
-        more = [Inequality.of(near, range(2 * N + 1))]
-    try:
-        x = certified.solve(cost, "the set of gains", more)
-    except Infeasible as error:
-        line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
-        raise Infeasible(error.problem, error.results, line) from error
-    return x[: 2 * N]

@@ -23,7 +23,7 @@ from haptic_loop.design.conditions import covers
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LimitedForces, least_multiplier
 from haptic_loop.design.lmi import Shaping
 from haptic_loop.design.result import RANGES, Infeasible
-from haptic_loop.design.spring_damper import _GainSet, step
+from haptic_loop.design.spring_damper import _GainSet, _step
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link, Population
 from haptic_loop.sim.report import _PRINTED_TAU_DB
@@ -462,7 +462,7 @@ def test_no_convex_step_increases_the_norm():
     for _ in range(5):
         k, b = np.split(np.maximum(gains, 0) * np.tile(shaping.usable, 2), 2)
         norms.append(shaping.gain(SpringDamper(k / T, b).compliance(T), w).max())
-        gains, bound = step(shaping, _GainSet(shaping.loop), gains, norms[-1], w)
+        gains, bound = _step(shaping, _GainSet(shaping.loop), gains, norms[-1], w)
         assert bound <= norms[-1] * (1 + 1e-6)
     assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(norms))
     assert norms[-1] < 0.8 * norms[0]

@@ -10,7 +10,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design import forked
 from haptic_loop.design.audit import audit
 from haptic_loop.design.forked import Forked
-from haptic_loop.design.spring_damper import design_with
+from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
 
 LOOPS = Path(__file__).parents[2] / "benchmarks/loops"
@@ -70,7 +70,7 @@ def test_an_audit_is_the_same_with_one_process(monkeypatch):
 def test_gains_are_the_same_with_one_process(name, monkeypatch):
     """The gains come from the first start or, for the chain, from another one."""
     loop = load(name).loop("I")
-    both = design_with(loop, "this-environment")
+    both = design(loop, "this-environment")
     monkeypatch.setattr(forked, "allowed", False)
-    alone = design_with(loop, "this-environment")
+    alone = design(loop, "this-environment")
     assert (both.coupling.form(), both.c, both.sdps) == (alone.coupling.form(), alone.c, alone.sdps)

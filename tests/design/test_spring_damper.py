@@ -39,9 +39,8 @@ def random_starts(count, seed=0):
 
 
 @pytest.mark.parametrize(("case", "norm"), [("I", 11.248), ("II", 11.318)])
-@pytest.mark.parametrize("start", [None, *random_starts(2)])
-def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
-    optimum = design(pair(CASES[case]), starts=() if start is None else [start])
+def test_the_known_optimum_is_reached(case, norm):
+    optimum = design(pair(CASES[case]))
     # Without the reserve K would be (878.86, 551.94) N/m; the reserve costs 0.01 %.
     np.testing.assert_allclose(optimum.coupling.K, np.array([878.86, 551.94]) * (1 - RESERVE), rtol=2e-5)
     np.testing.assert_allclose(optimum.coupling.B, [0.3865, 0.5220], rtol=1e-3)
@@ -54,7 +53,7 @@ def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
 def test_dampers_that_cost_stiffness_are_zero(condition):
     """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness, so B = 0 is best at a stiff wall."""
     wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
-    optimum = design(pair((0,), wall, (0,), (0,), (0.5,)), condition)
+    optimum = design(pair((0,), wall, (0,), (0,), (0.5,)), condition, limiter=False)
     assert optimum.coupling.B[0] == 0.0
     assert optimum.requirement.certified
 
@@ -190,15 +189,6 @@ def test_unlike_channels_are_as_stiff_as_alone():
     np.testing.assert_allclose(optimum.coupling.K, alone, rtol=1e-4)
 
 
-def test_designs_minimise_the_norm_with_their_weight():
-    """By the norm with a flat weight, the design for this weight is no worse than that for the default low-pass."""
-    flat = Lti.constant(np.eye(2), T)
-    loop = pair((0, 0))
-    optimum, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
-    assert optimum.objective <= Shaping(loop, W2=flat).norm(default)[0] * (1 + 1e-5)
-    assert optimum.requirement.certified
-
-
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0), (0, 2)])
 def test_designs_for_delayed_environments_are_certified(psi):
     loop = pair((0, 0), SOFT_NETWORK, psi=psi)
@@ -222,7 +212,7 @@ def test_zero_multiplier_gives_the_plain_condition():
 @pytest.mark.parametrize(("case", "rms_db"), [("I", -10.98), ("II", -7.99)])
 def test_this_environment_designs_exceed_any_environments_stiffness(case, rms_db):
     loop = pair(CASES[case])
-    optimum = design(loop, "this-environment")
+    optimum = design(loop, "this-environment", limiter=False)
     assert 20 * np.log10(optimum.objective) <= rms_db
     assert optimum.requirement.condition == "this-environment"
     assert optimum.requirement.ratio <= 1 - RESERVE
@@ -234,7 +224,7 @@ def test_this_environment_designs_stabilise_delayed_environments():
     """An almost rigid coupling would need more than the available damping."""
     held = Network(("c",), (Spring(("c", "m"), 800.0, 1.0), Spring(("m", "ground"), 700.0, 1.0)), {"m": 1.0})
     loop = pair((0,), held, (2,), (1,), (2.0,))
-    optimum = design(loop, "this-environment")
+    optimum = design(loop, "this-environment", limiter=False)
     assert optimum.requirement.ratio <= 1 - RESERVE
     rigid = force_map(loop.E(), SpringDamper([1e6], [0.0]), loop.theta, loop.psi)
     assert this_environment(rigid, loop.delta).ratio > 1
@@ -244,7 +234,7 @@ def test_this_environment_designs_stabilise_delayed_environments():
 @pytest.mark.slow
 def test_failed_searches_claim_no_impossibility():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
-        design(pair((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
+        design(pair((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment", limiter=False)
     assert not isinstance(caught.value, Infeasible)
 
 
@@ -272,16 +262,13 @@ REFUSALS = [
     ({"theta": (1,)}, "theta has 1 entries, the environment has 2 contacts"),
     ({"theta": (1.5, 2)}, "theta is .*whole numbers"),
     ({"psi": (0, -1)}, "psi is .*whole numbers"),
-    ({"W2": Lti.constant([[1.0, 0.5], [0.5, 1.0]], T)}, "W2 must be diagonal"),
-    ({"W2": Lti.constant([[1.0]], T)}, "W1 and W2 must fit"),
 ]
 
 
 @pytest.mark.parametrize(("change", "message"), REFUSALS)
 def test_a_bad_request_gets_one_line(change, message):
-    weight = {name: change[name] for name in change if name == "W2"}
     with pytest.raises(ValueError, match=message) as caught:
-        design(pair(**{name: change[name] for name in change if name not in weight}), **weight)
+        design(pair(**change))
     assert "\n" not in str(caught.value)
 
 
@@ -335,13 +322,13 @@ def test_designs_that_take_minutes_are_refused_early():
     springs = tuple(Spring((name, "ground"), 300.0) for name in names)
     many = Loop(T, *[(0,) * 49] * 3, (1.0,) * 49, Network(names, springs))
     with pytest.raises(DesignFailed, match=r"49 channels.*48"):
-        spring_damper.design_with(many, "any-environment")
+        design(many, "any-environment")
     with pytest.raises(DesignFailed, match=r"49 channels.*32 for a spring-damper by the limiter"):
-        spring_damper.design_with(many, "this-environment", limiter=True)
+        design(many, "this-environment", limiter=True)
     four = Network(names[:4], springs[:4])
     late = Loop(T, (0,) * 4, (100,) * 4, (0,) * 4, (1.0,) * 4, four)
     with pytest.raises(DesignFailed, match="some 150 sweeps over 404 states and 4 channels would take about"):
-        spring_damper.design_with(late, "this-environment")
+        design(late, "this-environment")
 
 
 @pytest.mark.slow
@@ -362,7 +349,7 @@ def test_no_limiter_search_follows_a_failed_linear_search() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spring_damper, "LimiterLoop", lambda *args: limited.append(args))
         with pytest.raises(DesignFailed, match="this-environment condition certifies for theta"):
-            spring_damper.design_with(loop, "this-environment")
+            design(loop, "this-environment")
     assert not limited
 
 

@@ -12,6 +12,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import Spring
 from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design import spring_damper
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.coupling_file import load as load_stored
 from haptic_loop.design.optimal import design_with
@@ -68,11 +69,11 @@ def test_the_worst_switching_excites_no_lossless_hand(designed):
     assert growing(assemble(placed[1], coupling)) > 0
 
 
-def test_designs_refuse_too_wide_ranges_of_delays():
+def test_designs_refuse_too_wide_ranges_of_delays(monkeypatch):
+    monkeypatch.setattr(spring_damper, "_starts", lambda loop: [SpringDamper([2e4, 2e4], [0.5, 0.5])])
     loop = load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I")
-    starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
-        design(loop.switching(DelayRange((0, 0), (9, 9))), "this-environment", starts)
+        design(loop.switching(DelayRange((0, 0), (9, 9))), "this-environment")
 
 
 @pytest.mark.parametrize(
@@ -91,8 +92,6 @@ def test_invalid_varying_delays_are_refused(options, tmp_path):
 @pytest.mark.slow
 def test_any_environment_designs_take_varying_delays(tmp_path):
     """The search assumes constant delays. It is repeated with less damping until switching delays are certified."""
-    with pytest.raises(ValueError, match="this-environment only"):
-        design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
     main(["--condition", "any-environment", "--varying-delay", "1,2", "--out", str(tmp_path / "c.json")])
     loop, coupling = load().loop("I"), load_stored(tmp_path / "c.json").coupling.build(load().T)
     assert switching_sweep(loop.sent(coupling), *RANGE, loop.delta).certified
