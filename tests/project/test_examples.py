@@ -59,8 +59,8 @@ PRINTED = {
 }
 
 
-#: examples that users search for; each has under 60 lines and saves a picture
-SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall", "wheel")
+#: examples that save a picture
+DRAWING = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall", "wheel")
 
 #: a part of each long example and its quicker replacement; `make validate` runs these examples unchanged
 SHORTER = {
@@ -107,6 +107,5 @@ def test_an_example_runs(path, change, tmp_path):
     assert done.returncode == 0, done.stderr
     missing = [words for words in PRINTED[path.stem] if not re.search(words, done.stdout)]
     assert not missing, done.stdout
-    if path.stem in SEARCHED_FOR:
+    if path.stem in DRAWING:
         assert [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".pdf") and file.stat().st_size > 5000]
-        assert len(text.splitlines()) < 60

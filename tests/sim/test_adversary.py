@@ -63,7 +63,6 @@ def test_the_condition_is_tight_with_long_delays():
     """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping the loop is destabilised."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
-    print([(row.short, row.worst.growth) for row in rows])
     assert [row.worst.destabilises for row in rows] == [False, True]
     assert 6 < rows[1].worst.frequency_hz < 10
 
@@ -114,7 +113,6 @@ def test_one_person_destabilises_only_with_too_little_damping(monkeypatch):
     both_hands(monkeypatch)
     light = SCENARIO.replace(device=(RigidDevice(mass=0.02),) * 2)
     rows = attempts({"designed": (light, DESIGNED)}, np.array([-1e-3, 0.05]), generations=30)
-    print([(row.short, row.worst.growth) for row in rows])
     assert [row.worst.destabilises for row in rows] == [False, True]
 
 

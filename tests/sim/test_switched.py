@@ -115,7 +115,7 @@ def test_switching_can_grow_beyond_constant_delays():
         for ages in ((1, 1), (1, 2), (2, 1), (2, 2))
     }
     assert growth[1, 2] < 0
-    assert worst.growth > max(growth.values())  # a delay of 2 on channel 1 is bad (+1.68 1/s), switching is worse
+    assert worst.growth > max(growth.values())  # a constant delay of 2 on channel 1 gives +1.68 1/s
 
 
 def test_loops_grow_under_greedy_not_under_random_ages():
