@@ -25,9 +25,9 @@ FIGURE_4 = Network(
 
 
 def checkered(*sides):
-    """Return all combinations of a value from each of `sides` as parameters; every second runs in `make validate` only.
+    """Return all combinations of a value from each of `sides` as parameters. Every second runs in `make validate` only.
 
-    Like the fields of one colour on a chess board, `make test` combines each value with half of the other side's.
+    `make test` runs every second one, like the fields of one colour on a chess board: each value occurs.
     """
     marks = ((), pytest.mark.validate)
     places = product(*(enumerate(side) for side in sides))
@@ -108,7 +108,7 @@ def undelayed_map(coupling) -> Lti:
 
 
 def loop_of(network, theta, psi, period: float = T) -> Loop:
-    """Return a loop with arbitrary damping and reference, on which a tick does not depend."""
+    """Return a loop whose damping and reference are arbitrary, because a tick does not depend on them."""
     return Loop(period, tuple(theta), tuple(psi), (0,) * len(theta), (1.0,) * len(theta), network)
 
 

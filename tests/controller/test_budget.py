@@ -159,7 +159,7 @@ def test_the_budget_holds_on_stiffer_springs():
     ],
 )
 def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, report):
-    """The budget learns which forces acted at once, four ticks late, or never."""
+    """The budget learns which forces acted at once or four ticks late, or it never learns it."""
     rng, nsim = np.random.default_rng(8), 90
     hands = Hands(rng, nsim, True, 0.01)
     W0, initial, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4
@@ -197,7 +197,7 @@ def test_coarse_encoders_keep_the_guarantee(case):
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
         for k in range(500):
             now = np.round(hands.x / q) * q
-            wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # changing forces cost energy behind coarse encoders
+            wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # behind coarse encoders, changes cost energy
             sent = budget.limit(wanted, now - seen)
             if case == "late" and k >= 3:
                 budget.tell(k - 3, acted[k - 3])

@@ -273,7 +273,7 @@ def test_limiter_and_environment_are_passive_without_rho():
 
 @pytest.mark.slow
 def test_clipped_cycles_give_energy_limited_ones_none():
-    """On a circle of radius 4 cm, clipping each force by itself gives two hands 0.616 J per turn at any speed."""
+    """On a circle of radius 4 cm, forces that are clipped one by one give two hands 0.616 J per turn at any speed."""
     coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
     limit = np.array(LIMITS)[:, None]
     linear = Process(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling), np.full(2, np.inf), np.zeros(2))
@@ -288,7 +288,7 @@ def test_clipped_cycles_give_energy_limited_ones_none():
         f = drive(closed(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling, LIMITS, rho)), x).f[: 2 * ticks]
         assert (
             abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated
-        )  # the delay and the network's damping make this rest
+        )  # this rest comes from the delay and the network's damping
         assert (np.abs(f).max(axis=0) <= limit).all()
 
 

@@ -113,7 +113,7 @@ def resonance(width: float, angle: float, size: float = 1.5, floor: float = 500.
 
 @pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-6, 1e-7, 1e-9])
 def test_no_narrow_resonance_hides_from_passivity(width):
-    """A block is accepted exactly if He [E/(1 - 1/z)] = He H is positive on a fine sweep around the resonance."""
+    """A block is accepted if and only if He [E/(1 - 1/z)] = He H is positive on a fine sweep around the resonance."""
     w = 1.2 + np.concatenate([width * np.linspace(-50, 50, 4001), np.linspace(-1.2, 1.9, 2001)])
     verdicts = set()
     for size, angle in ((1.5, 1.536), (1.5, 1.6), (1.0, 0.0), (30 * width, 1.6), (200 * width, 3.0), (400 * width, 2)):

@@ -141,7 +141,7 @@ BOXED = Network(
 @pytest.mark.parametrize("coupling", [NoCoupling(), SpringDamper([2e4, 1e4], [1.0, 0.0])], ids=["none", "stiff"])
 @pytest.mark.parametrize("psi", [(0, 0), (0, 2)])
 def test_a_touching_wall_is_a_spring_damper(coupling, psi):
-    """If walls always touch, the difference of two runs equals that with springs in place of the walls."""
+    """If walls always touch, two runs differ by as much as with spring-dampers in place of the walls."""
     walls = (Wall(("contact 1", GROUND), 5000.0, 3.0, -1.0), Wall(FIGURE_4.contacts, 2000.0, 1.0, -1.0))
     network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
     x = wander(300, 2, 2)

@@ -70,7 +70,7 @@ def test_another_loop_loses_the_guarantee(changes):
 
 
 def test_an_energy_account_covers_no_latency():
-    """A hand that moves only before forces latch takes energy from the previous force; the account misses it."""
+    """A hand that moves only before forces latch takes energy from the previous force, which no account counts."""
     assert assess(LOOP, HERE_ONLY, energy_budget=0.1).guarantee.condition == "energy-budget"
     late = change(LOOP, latency=((0.0, 2e-4),))
     for accounted in ({"energy_budget": 0.1}, {"environment": lambda x: -100 * x}):
@@ -238,7 +238,7 @@ def test_a_swept_limiter_makes_the_guarantee_sampled(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [((0.0,),), ((4.0,),), ((0.7,), (0.7,))])
 def test_wrong_multipliers_of_a_limiter_are_replaced(wrong):
-    """Multipliers 0 and 4 do not certify this coupling with limited forces, and two multipliers are for two devices."""
+    """Multipliers 0 and 4 do not certify this coupling with limited forces; two multipliers fit two devices only."""
     right, none = ((0.75,),), None
     c = [assess(LOOP, Chosen(HERE_ONLY, "this-environment", c=c)).force_limits.c for c in (right, wrong, none)]
     assert c[0] == right

@@ -141,7 +141,7 @@ def test_the_stiffest_spring_is_at_colgates_bound(condition, theta, K):
 
 
 def test_the_stiffest_gains_respect_full_levels():
-    """With theta = 0 the equal K of both axes are certified below 2 (least eigenvalue of Delta - B)/T."""
+    """With theta = 0 equal K of both axes are certified up to 2/T times the least eigenvalue of Delta - B."""
     level = np.array([[1.0, 0.9], [0.9, 1.0]])
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
     loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.0, 1.0), plane, axes=(2,), levels=(tuple(map(tuple, level.tolist())),))

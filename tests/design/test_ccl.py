@@ -116,7 +116,7 @@ def test_every_descent_step_is_feasible_and_better():
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # the optimum is compared to 1e-3 only
 def test_the_zeros_are_optimal_for_the_poles(inner):
     """With the poles fixed, condition and norm are convex at each frequency. The design equals the optimum of cvxpy."""
-    import cvxpy as cp  # at the top it would take every worker that collects this file more than a second
+    import cvxpy as cp  # the import takes over a second in every worker that collects this file
 
     loop, design = inner
     shaping, poles = Shaping(loop), np.diag(design.coupling.V.A)
@@ -182,7 +182,7 @@ def test_an_order_of_zero_is_refused(options, message):
 
 
 def test_a_free_mass_is_called_useless(tmp_path, capsys):
-    """A free mass has no static stiffness. Its design warns nowhere, though SciPy's Lyapunov solver would."""
+    """A free mass has no static stiffness. Its design emits no warning, though SciPy's Lyapunov solver would."""
     scenario = tmp_path / "free.toml"
     text = 'name = "free"\nT = 1e-3\nduration = 1.0\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\n'
     scenario.write_text(text + 'damping = 1.37\n[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')

@@ -316,7 +316,7 @@ def test_realisations_changed_by_rounding_are_refused(condition):
 
 @pytest.mark.parametrize("least", [0, 10**6])
 def test_second_processes_refuse_rounding(least, monkeypatch):
-    """A large proof and the check of rounding are computed at the same time, with the same verdicts."""
+    """A large proof and the check of its rounding, computed at the same time, give the verdicts of one process."""
     monkeypatch.setattr("haptic_loop.design.forked.allowed", True)
     monkeypatch.setattr("haptic_loop.design.certificate._FORKED", least)
     loop = at_springs(1000.0, 0.0, 1, 5.0, 1e-3)

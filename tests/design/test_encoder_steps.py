@@ -101,7 +101,7 @@ def test_friction_covers_no_steps_of_known_devices():
 
 
 def test_steps_are_covered_with_one_object_only():
-    """The friction needed depends on F of the nominal environment; the guarantee covers every passive environment."""
+    """A guarantee for any passive object covers encoder steps with one object only, whose F sets the friction."""
     coupling = SpringDamper([879.0, 552.0], [0.39, 0.52])
     covered = EncoderSteps.of(LOOP, coupling, [STEP, STEP], [0.26, 0.26])
     words = verdict(replace(assess(LOOP, coupling), encoder=covered))
@@ -147,7 +147,7 @@ def _first_line(command, scenario, options, tmp_path, capsys):
 
 
 def stated(covered):
-    """Return a record whose words a command must state where friction covers encoder steps, or does not."""
+    """Return a record of which a command must state the words if friction covers the encoder steps, or does not."""
     return EncoderSteps((STEP,), (0.0,), (None,), None, covered, "")
 
 

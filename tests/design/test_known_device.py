@@ -236,9 +236,9 @@ def test_the_cost_is_concave_in_damping_and_beta():
 
 @pytest.mark.slow
 def test_tangents_bound_a_sweep_over_beta():
-    """Six bounds are at most the least share of sweeps over beta, and the last bound is within 10 % of it.
+    """Six bounds are at most the least share of the damping that sweeps over beta find; the last is within 10 % of it.
 
-    The first tangents touch at share 3 of the damping. Here c2 > 0 limits beta.
+    The first tangents touch at three times the damping. Here c2 > 0 limits beta.
     """
     T, high = 1e-3, 3.0
     loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
@@ -475,7 +475,7 @@ def test_a_small_beta_gives_this_environment():
 
 
 def test_uneven_periods_need_more_damping():
-    """For each of three beta a range of periods requires more than the period T, and the range [T, T] as much."""
+    """For three values of beta a range of periods requires more damping than the period T; [T, T] requires as much."""
     F, beta = wall(800.0, 0.6, 1, 1e-3), np.array([1e-5, 2e-5, 3e-5])
     even, same, wide = (
         [sweep_of(F, one(1e-3, 1.0, 1, **periods)).required(np.array([b]), 5.0)[0] for b in beta]
@@ -632,7 +632,7 @@ def test_loops_that_are_not_covered_are_refused(changes, message):
 
 
 def test_a_loop_without_known_devices_keeps_its_digest():
-    """The scenario omega-pair keeps the digest that it had before devices could be known."""
+    """The digest of the scenario omega-pair does not depend on the fields of known devices, which it lacks."""
     content = msgspec.to_builtins(PAIR)
     assert not {"known_devices", "T_min"} & set(content)
     assert load("omega-pair").digest.startswith("5e87cc8624324c7d")

@@ -144,7 +144,7 @@ def least_scale_of(demand):
 
 
 def test_weights_are_admitted_if_every_latency_admits_them():
-    """`Latency` accepts Q exactly if eigenvalues at many latencies show that it is allowed, also an indefinite Q."""
+    """`Latency` accepts a Q, even an indefinite one, if and only if eigenvalues at many latencies admit it."""
     rng, agreed = np.random.default_rng(0), np.zeros(2, dtype=int)
     for _ in [None] * 60:
         first, last = np.sort(np.round(rng.uniform(0, T, 2), 6))

@@ -131,7 +131,7 @@ def test_the_channel_with_the_largest_ratio_decides():
 
 @pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
 def test_a_free_mass_is_not_refused_by_rounding(mass):
-    """F(1) of a free mass is exactly 0, and from 0.3 kg on it needs the damping of a rigid wall to 0.3 %."""
+    """F(1) of a free mass is exactly 0. From 0.3 kg on, a mass needs the damping of a rigid wall, within 0.3 %."""
     free = environment(Network(("a",), masses={"a": mass}), T)
     F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
     assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)

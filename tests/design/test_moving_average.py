@@ -31,7 +31,7 @@ def test_scaled_moving_averages_need_inversely_scaled_damping(theta, factor):
 
 
 def test_channels_with_different_zeros_need_one_ratio():
-    """The ratio is 1/1.02. With three channels the order of singular vectors is not its own inverse."""
+    """The ratio is 1/1.02. With three channels the permutation of singular vectors is not its own inverse."""
     theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
     for m in (2, 3):
         V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])

@@ -47,7 +47,7 @@ def loop_of(name: str) -> Loop:
     return load(next(LOOPS.glob(f"{name}*.toml"))).loop("I")
 
 
-#: the bases that the design of each loop reported, by the loop's name
+#: loop's name -> the bases that its design reported
 REPORTED = {}
 
 
@@ -423,7 +423,7 @@ def test_ranges_fall_back_to_a_proved_basis():
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     optimum = design(ranged, replace(SMALLEST, seconds=5.0))
     assert optimum.proved
-    assert optimum.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment, only scaled down, reaches -3.05 dB
+    assert optimum.figures.rms_mismatch < 10 ** (-4 / 20)  # an environment that is only scaled down reaches -3.05 dB
 
 
 @pytest.mark.validate

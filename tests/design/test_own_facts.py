@@ -31,7 +31,7 @@ KNOWN = load("omega-pair-known").loop("I")
 
 
 class Less(Fact):
-    """Forces that return up to `less` dx^2 more energy per tick, `less` in N/m: `less` T more damping is required."""
+    """Forces return up to `less` dx^2 [J] more energy per tick, which requires `less` T more damping; `less` in N/m."""
 
     def __init__(self, less):
         self.less = less

@@ -117,7 +117,7 @@ def test_unsafe_switching_is_not_certified():
 
 
 def test_files_without_a_range_keep_their_digests():
-    """The expected digest was made before ranges of delays existed."""
+    """The recorded digest does not depend on the fields of varying delays, which the loop lacks."""
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
     assert digest(PAIR, STIFF.form()) == expected
     assert digest(LOOP, STIFF.form()) != expected

@@ -44,7 +44,7 @@ def block(z, G, alpha, lo, hi, damping):
 
 @pytest.mark.parametrize(("lo", "hi"), [(0, 0), (0, 1), (1, 2), (0, 3), (2, 5)])
 def test_springs_need_the_damping_of_their_longest_delay(lo, hi):
-    """The mean of lo and hi needs KT (lo + hi + 1)/2, the error T (alpha/2 + (hK)^2/(2 alpha)), h = (hi - lo)/2.
+    """The mean delay needs KT (lo + hi + 1)/2, and deviations by h = (hi - lo)/2 need T (alpha/2 + (hK)^2/(2 alpha)).
 
     The least sum is KT (hi + 1/2), as for the constant delay hi: for a spring, varying delays cost nothing more.
     """

@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import load as load_scenario
 from tests.pseudo_terminal import Terminal
 
 BEHIND = (0, 1)  # ticks by which forces of each channel act later than the link's delay
-SLIP_SOON = 1020.0  # [us] second board's first tick; clocks 100 ppm apart make its samples late soon after full gain
+SLIP_SOON = 1020.0  # [us] first tick of the second board; its clock, 100 ppm off, slips a tick soon after full gain
 
 
 @pytest.fixture(scope="module")

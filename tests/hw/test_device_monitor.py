@@ -133,7 +133,7 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, link_couplings):
 
 
 def hand_driven(scenario, link_couplings, tested=False, behind=()):
-    """Return a session that has begun to arm, and a function that sends it a STATE; its time is `lie` [us], if any."""
+    """Return a session that has begun to arm, and a function that sends a STATE, with the time `lie` [us] if given."""
     settings = LinkSettings(measure=50, test_encoders=tested, behind=behind)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)

@@ -517,7 +517,7 @@ def test_still_encoders_under_force_are_dead(newton, found):
 
 @pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
 def test_coarse_counts_hide_a_calm_tremor(count, dead):
-    """A tremor of 30 um always leaves two counts of 15 um, but it fits into two counts of 16 um or more."""
+    """A tremor of 30 um always spans more than two counts of 15 um, but it fits into two counts of 16 um or more."""
     monitor = monitor_of(count)
     for _ in range(round(0.6 / T)):
         monitor.check((0,), (1250,), 1)  # 0.5 N

@@ -59,7 +59,7 @@ def test_voluntary_motion_and_encoder_steps_are_no_oscillation():
 
 
 def test_flicker_below_the_named_size_is_no_oscillation():
-    """The first window sees 1.08 um at 5 Hz: more than the rounding in its octave, 0.2 um, but less than 1.1 um."""
+    """In the first window 1.08 um at 5 Hz exceed the rounding in this octave, 0.2 um, but not the named 1.1 um."""
     measured = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
     assert measured.reason == "nothing oscillates above 1.1 um"
 

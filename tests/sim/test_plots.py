@@ -283,7 +283,7 @@ def test_cells_meet_halfway():
 
 
 def test_panels_show_forces_beside_ideal_ones(undrawn):
-    """Both panels show 1.5 times the largest ideal force of `calm`, the only run that is credible to its end."""
+    """The axes of both panels end at 1.5 times the largest ideal force of `calm`, the only run credible to its end."""
     f, t = np.array([[0.0], [1.0], [3.0]]), T * np.arange(3)
     panels = [plots.Panel("calm", trace(f), 2 * f), plots.Panel("wild", trace(5 * f), 9 * f, 1.5e-3)]
     figure = undrawn(plots.plot_side_by_side, panels)

@@ -178,7 +178,7 @@ def test_a_run_reports_the_times_of_ticks(tmp_path, capsys):
 
 @pytest.mark.validate
 def test_engines_agree_on_hands_at_uneven_ticks(tmp_path):
-    """With a coupling no hand makes the loop grow; without one some do, and both engines agree which."""
+    """With a coupling no hand makes the loop unstable. Without one some do, and both engines agree which."""
     file = tmp_path / "r.json"
     ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "3", "--duration", "0.3"]
     options = [*ticks, "--no-plot", "--out", str(tmp_path), "--json", str(file)]
@@ -311,7 +311,7 @@ def test_both_engines_trace_late_forces():
 
 @pytest.mark.slow
 def test_the_energy_audit_sees_late_forces():
-    """With a certified coupling no loop gives energy; without coupling some do, and all of these are unstable."""
+    """With a certified coupling no loop gives energy. Without one some loops do, and all of these are unstable."""
     late = PAIR.replace(latency=LATE)
     for coupling, gives in ((SOFT, False), (NoCoupling(), True)):
         findings = _examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))

@@ -100,7 +100,7 @@ class Touch:
 
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
-    """Hands are thrown at each scene, one device with a delay of 2 samples, and the shell never acts."""
+    """Hands are thrown at each scene, where one device has a delay of 2 samples. The shell never acts."""
     rng = np.random.default_rng(3)
     for run in (0, 2):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
@@ -283,7 +283,7 @@ def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
 
 @pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
 def test_contacts_that_give_energy_are_held_back(tmp_path, impedance, gives_J):
-    """Contacts of 0.1 kg hit walls: solimp 0.99 and MuJoCo's default give energy; the shell passes at most W0."""
+    """Contacts of 0.1 kg hit walls, which with solimp 0.99 and by default give energy; the shell passes at most W0."""
     tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
     walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))
     text = f"""<mujoco><option gravity="0 0 0"/><default><geom solimp="{impedance} 0.001"/></default><worldbody>{walls}
@@ -322,7 +322,9 @@ def test_a_guarantee_names_its_bound_in_joules(tmp_path):
     loop = alone(tmp_path, 0.0, duration=0.2)
     words = simulate(loop, certified(loop)).meta["guarantee"]
     bound = float(words.partition(", here at most ")[2].partition(" J in all")[0])
-    assert bound == pytest.approx(START_J + (9.81 * 0.2) ** 2 / 2, rel=0.02)  # the sums of a step differ by g T
+    assert bound == pytest.approx(
+        START_J + (9.81 * 0.2) ** 2 / 2, rel=0.02
+    )  # in discrete steps the speed differs by g T
 
 
 def test_a_scene_that_diverges_has_no_guarantee(tmp_path, capsys):
