@@ -68,7 +68,7 @@ def test_one_sided_coupling_of_forces_is_solved():
     np.testing.assert_allclose([v[:, 0], f[:, 0]], [[0.0, 1.0], [0.0, 1.0]], rtol=0, atol=1e-12)
 
 
-def test_two_channels_by_hand():
+def test_two_channels_equal_a_calculation_by_hand():
     upper = np.array(LIMITS)
     e, f = BoxProblem(np.array([[1000.0, -900.0], [-900.0, 1000.0]]), -upper, upper).solve(np.array([[20.0], [5.0]]))
     np.testing.assert_allclose(f[:, 0], LIMITS, rtol=1e-12)
@@ -95,7 +95,7 @@ def test_a_matrix_with_a_negative_minor_is_refused():
         BoxProblem(np.array([[1.0, 2.0], [2.0, 1.0]]), -np.ones(2), np.ones(2))
 
 
-def test_a_spring_by_hand():
+def test_a_limited_spring_equals_calculations_by_hand():
     """The forces for G = 1000, L = 1, rho = 20 and theta = 0 were computed by hand."""
     limiter = Limiter(Lti.constant([[1000.0]], 1.0), (0,), limit=np.ones(1), rho=np.array([20.0]))
     x = np.array([0, 0.0005, 0.002, 0.003, 0.002, 0.0005, 0, -0.002])

@@ -31,7 +31,7 @@ def process(F: Lti, limit=np.inf, step=0.0) -> Process:
     return Process(Law(F), np.full(F.inputs, limit), np.full(F.inputs, step))
 
 
-def test_three_ticks_by_hand():
+def test_three_ticks_equal_a_calculation_by_hand():
     """A spring-damper of 1000 N/m and 2 N s/m is behind a coupling spring of 1000 N/m; theta = 1, the limit is 5 N.
 
     The coupling's force f_e moves the end of the coupling from u-, one tick before, to u:

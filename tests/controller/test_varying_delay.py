@@ -30,7 +30,7 @@ def carried(delays, forces):
     return applied
 
 
-def test_hold_last_by_hand():
+def test_devices_hold_the_newest_packet_that_arrived():
     """The device applies the newest packet that has arrived.
 
     k          0    1    2    3    4     5    6

@@ -317,7 +317,7 @@ def test_a_bad_wall_gets_one_line(old, new, message):
     assert says(caught.value, message)
 
 
-def test_at_most_six_walls():
+def test_more_than_six_walls_are_refused():
     with pytest.raises(InputError, match=r"environment.walls: expected `array` of length <= 6"):
         parse(TEXT.replace("walls = [", "walls = [" + 6 * '{ between = ["tip", "ground"], stiffness = 1.0 }, '))
 

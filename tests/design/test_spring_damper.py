@@ -239,7 +239,7 @@ def test_failed_searches_claim_no_impossibility():
 
 
 @pytest.mark.validate
-def test_proposed_changes_hold_when_made():
+def test_proposed_changes_are_certified():
     """Each proposed design is certified by a sweep. The least error comes first, and none is the failed request."""
     loop = pair((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")

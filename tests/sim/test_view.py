@@ -155,7 +155,7 @@ def test_frames_show_forces_since_the_previous_frame(none):
     assert np.array_equal(again.mean, frame.history[-1])
 
 
-def test_rest_is_where_a_held_position_leads(published):
+def test_rest_is_the_state_of_held_positions(published):
     """At rest the state z obeys z = A z + B x, and the transfer function F gives the force F(1) x."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
@@ -806,7 +806,7 @@ def ball():
 
 
 @pytest.mark.slow
-def test_live_worlds_feel_as_in_a_run(tmp_path):
+def test_live_worlds_have_the_forces_of_runs(tmp_path):
     """The live loop delays forces itself, and sim.run delays them as packets; forces and energies are equal."""
     tray = first_loop(Menu("I"), world_scenario(tmp_path, TRAY, more=UP, duration=0.5), "moving-average")
     running = LiveLoop(tray, Inline(), (), math.inf)

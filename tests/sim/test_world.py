@@ -322,9 +322,7 @@ def test_a_guarantee_names_its_bound_in_joules(tmp_path):
     loop = alone(tmp_path, 0.0, duration=0.2)
     words = simulate(loop, certified(loop)).meta["guarantee"]
     bound = float(words.partition(", here at most ")[2].partition(" J in all")[0])
-    assert bound == pytest.approx(
-        START_J + (9.81 * 0.2) ** 2 / 2, rel=0.02
-    )  # in discrete steps the speed differs by g T
+    assert bound == pytest.approx(START_J + (9.81 * 0.2) ** 2 / 2, rel=0.02)  # discrete speeds differ by g T
 
 
 def test_a_scene_that_diverges_has_no_guarantee(tmp_path, capsys):
