@@ -14,6 +14,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, BallProblem, BoxProblem, magnitudes
 from haptic_loop.controller.law import Limiter
@@ -204,7 +205,7 @@ def _sequential(
     z, outputs = np.zeros(system.order, dtype), []
     limits = _limits(limiter, dtype) if limiter else None
     table = _Balls.of(limiter, dtype) if limiter and limiter.balls else None
-    M = [list(row) for row in _box_matrix(limiter).astype(dtype)] if limiter and not table else []
+    M = _box_matrix(limiter).astype(dtype) if limiter and not table else np.eye(0)
     for u in inputs.astype(dtype):
         sums = np.zeros(len(rows), dtype)
         for column, value in zip(rows.T, [*z, *u], strict=True):
@@ -212,7 +213,7 @@ def _sequential(
         if limiter and limits is not None:
             free = sums[limiter.sent_rows]
             if limiter.balls or (np.abs(free) > limits).any():
-                e, f = _balled(table, list(free)) if table else _boxed(M, list(limits), list(free))
+                e, f = _balled(table, free) if table else _boxed(M, limits, free)
                 for column, value in zip(limiter.kick.astype(dtype).T, e, strict=True):
                     sums = sums + column * value
                 sums[limiter.sent_rows] = f
@@ -239,182 +240,128 @@ def _rounding(single: bool) -> float:
     return float(np.float32(_SINGLE_ROUNDING)) if single else PIVOT_ROUNDING
 
 
-def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Solve f = q - M e for (e, f) by the operations of the C file, in their order and in the precision of q."""
-    m, real = len(q), type(q[0])
-    zero, one = real(0), real(1)
-    rounding = real(_rounding(real is np.float32))
-    sign, e, f = [zero] * m, [zero] * m, [zero] * m
+def _in_order(terms: Any) -> Any:
+    """Return the sum of the terms, which are added one after another as in the C file."""
+    return np.add.accumulate(terms)[-1]
+
+
+def _solved(rows: Array, pivoting: bool) -> Array:
+    """Solve A x = b (n,) for the rows [A b] (n, n + 1), which are changed, as the C file does."""
+    n, x = len(rows), rows[:, -1].copy()
+    for k in range(n):
+        if pivoting:
+            pivot = k + np.argmax(np.abs(rows[k:, k]))
+            rows[[k, pivot]] = rows[[pivot, k]]
+        ratio = rows[k + 1 :, k] / rows[k, k]
+        rows[k + 1 :, k + 1 :] -= np.outer(ratio, rows[k, k + 1 :])
+    for i in reversed(range(n)):
+        x[i] = _in_order([rows[i, n], *-(rows[i, i + 1 : n] * x[i + 1 :])]) / rows[i, i]
+    return x
+
+
+def _boxed(M: Array, limit: Array, q: Array) -> tuple[Array, Array]:
+    """Solve f = q - M e (m,) for (e, f) by the operations of the C file, in their order and in the precision of q."""
+    m, real = len(q), q.dtype.type
+    zero, rounding, sign = real(0), real(_rounding(real is np.float32)), np.zeros(m, real)
+    e = f = q
     for _ in range(_turns(m)):
-        a = [[M[i][j] if sign[i] and sign[j] else real(i == j) for j in range(m)] for i in range(m)]
-        v = [q[i] - sign[i] * limit[i] if sign[i] else zero for i in range(m)]
-        for k in range(m):
-            for i in range(k + 1, m):
-                ratio = a[i][k] / a[k][k]
-                for j in range(k + 1, m):
-                    a[i][j] -= ratio * a[k][j]
-                v[i] -= ratio * v[k]
-        for i in reversed(range(m)):
-            for j in range(i + 1, m):
-                v[i] -= a[i][j] * v[j]
-            v[i] /= a[i][i]
-        wrong = False
-        for i in range(m):
-            sum_, size = q[i], abs(q[i])
-            for j in range(m):
-                sum_ -= M[i][j] * v[j]
-                size += abs(M[i][j] * v[j])
-            tiny = size * rounding
-            e[i] = v[i] if sign[i] * v[i] > 0.0 else zero
-            f[i] = limit[i] if sum_ > limit[i] else -limit[i] if sum_ < -limit[i] else sum_
-            if sign[i]:
-                f[i] = sign[i] * limit[i]
-            if wrong:
-                continue
-            wrong = True
-            if not sign[i] and sum_ > limit[i] + tiny:
-                sign[i] = one
-            elif not sign[i] and sum_ < -limit[i] - tiny:
-                sign[i] = -one
-            elif sign[i] and sign[i] * v[i] * M[i][i] < -tiny:
-                sign[i] = zero
-            else:
-                wrong = False
-        if not wrong:
+        active = sign != 0
+        A = np.where(np.outer(active, active), M, np.eye(m, dtype=real))
+        v = _solved(np.column_stack([A, np.where(active, q - sign * limit, zero)]), pivoting=False)
+        products = (M * v).T
+        force = _in_order([q, *-products])
+        tiny = _in_order([np.abs(q), *np.abs(products)]) * rounding
+        e = np.where(sign * v > 0, v, zero)
+        f = np.where(active, sign * limit, np.clip(force, -limit, limit))
+        wrong = np.where(active, sign * v * np.diag(M) < -tiny, np.abs(force) > limit + tiny)
+        if not wrong.any():
             break
+        first = np.argmax(wrong)
+        sign[first] = zero if active[first] else np.sign(force[first])
     return e, f
 
 
 class _Balls(NamedTuple):
     """The problem f = q - M e for limited force vectors, with the channels in the order in which blocks are solved."""
 
-    at: list[int]  # (m,) channel of each entry
-    first: list[int]  # (m,) first entry of the vector to which each entry belongs
-    last: list[int]  # (m,) end of the vector to which each entry belongs
-    end: list[int]  # end of each block, whose vectors are solved together
-    M: list[list[Any]]
-    resolvent: list[list[Any]]  # (I + M/tau)^-1 of each block
-    tau: list[Any]
-    limit: list[Any]
+    at: NDArray[np.intp]  # (m,) channel of each entry
+    first: NDArray[np.intp]  # (m,) first entry of the vector to which each entry belongs
+    last: NDArray[np.intp]  # (m,) end of the vector to which each entry belongs
+    end: NDArray[np.intp]  # end of each block, whose vectors are solved together
+    M: Array  # (m, m)
+    resolvent: Array  # (m, m), (I + M/tau)^-1 of each block
+    tau: Array  # (m,)
+    limit: Array  # (m,) [N]
 
     @classmethod
     def of(cls, limiter: Limiter, dtype: type[np.floating]) -> _Balls:
         problem = limiter.problem
         assert isinstance(problem, BallProblem)
         blocks = problem.blocks
-        at = np.concatenate([block.at for block in blocks])
+        at, tau = (np.concatenate(parts) for parts in zip(*((b.at, b.tau[:, 0]) for b in blocks), strict=True))
         end, sizes = np.cumsum([block.at.size for block in blocks]), [n for block in blocks for n in block.balls]
+        last = np.repeat(np.cumsum(sizes), sizes)
         M, resolvent = problem.M[np.ix_(at, at)], np.eye(at.size)
-        for block, last in zip(blocks, end.tolist(), strict=True):
-            own = slice(last - block.at.size, last)
-            M[own, own], resolvent[own, own] = block.M, np.linalg.inv(resolvent[own, own] + block.M / block.tau[:, 0])
-        last, tau = np.repeat(np.cumsum(sizes), sizes), np.concatenate([block.tau[:, 0] for block in blocks])
-        M, resolvent = ([list(row) for row in part.astype(dtype)] for part in (M, resolvent))
-        first, limits = last - np.repeat(sizes, sizes), list(_limits(limiter, dtype)[at])
-        places = at.tolist(), first.tolist(), last.tolist(), end.tolist()
-        return cls(*places, M, resolvent, list(tau.astype(dtype)), limits)
+        for block, stop in zip(blocks, end, strict=True):
+            own = slice(stop - block.at.size, stop)
+            M[own, own], resolvent[own, own] = block.M, np.linalg.inv(resolvent[own, own] + block.M / tau[own])
+        M, resolvent, tau = (part.astype(dtype) for part in (M, resolvent, tau))
+        return cls(at, last - np.repeat(sizes, sizes), last, end, M, resolvent, tau, _limits(limiter, dtype)[at])
 
 
-def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
-    """Solve A x = b for entries begin to end of x, as the C file does; rows of `a` hold A, and b in column `end`."""
-    for k in range(begin, end):
-        pivot = k
-        for i in range(k + 1, end):
-            if abs(a[i][k]) > abs(a[pivot][k]):
-                pivot = i
-        a[k], a[pivot] = a[pivot], a[k]
-        for i in range(k + 1, end):
-            ratio = a[i][k] / a[k][k]
-            for j in range(k + 1, end + 1):
-                a[i][j] -= ratio * a[k][j]
-    for i in reversed(range(begin, end)):
-        x[i] = a[i][end]
-        for j in range(i + 1, end):
-            x[i] -= a[i][j] * x[j]
-        x[i] /= a[i][i]
-
-
-def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Solve f = q - M e for (e, f) line by line like the C function in _BALLS_DEFINED, in the precision of q."""
+def _balled(problem: _Balls, q: Array) -> tuple[Array, Array]:
+    """Solve f = q - M e (m,) for (e, f) like the C function in _BALLS_DEFINED, in the precision of q."""
     at, first, last, ends, M, resolvent, tau, limit = problem
-    m, real = len(q), type(q[0])
-    zero, one, two = real(0), real(1), real(2)
-    residual, rounding = real(_RESIDUAL), real(_ball_rounding(real is np.float32))
-    u, g, v, r, x, rhs, back, normal = ([zero] * m for _ in range(8))
-    e, f, share, a = [zero] * m, [zero] * m, [one] * m, [[zero] * (m + 1) for _ in range(m)]
-
-    begin = 0
+    e, f, v, begin = np.empty_like(q), np.empty_like(q), np.empty_like(q), 0
     for end in ends:
-        rows, solved, tried, best = range(begin, end), False, False, zero
-        for i in rows:
-            rhs[i] = q[at[i]]
-            for j in range(begin):
-                rhs[i] -= M[i][j] * v[j]
-            u[i] = rhs[i]
-        for _ in range(_MOST_STEPS):
-            size, worst = zero, zero
-            for i in rows:  # g is u, shortened to the limits, and v is (u - g)/tau.
-                square = zero
-                for k in range(first[i], last[i]):
-                    square += u[k] * u[k]
-                length = np.sqrt(square)
-                share[i], normal[i], g[i] = one, zero, u[i]
-                if length > limit[i]:
-                    share[i], normal[i] = limit[i] / length, u[i] / length
-                    g[i] = share[i] * u[i]
-                v[i] = (u[i] - g[i]) / tau[i]
-            for i in rows:  # residual r
-                terms = abs(g[i]) + abs(rhs[i])
-                r[i] = g[i] - rhs[i]
-                for j in rows:
-                    r[i] += M[i][j] * v[j]
-                    terms += abs(M[i][j] * v[j])
-                size = max(size, terms)
-            for i in rows:
-                worst = max(worst, abs(r[i]) / max(residual * limit[i], rounding * size))
-            if worst <= one:
-                solved = True
-                break
-            if tried and two * worst > best:  # Newton's step is replaced by that of Douglas and Rachford.
-                for i in rows:
-                    u[i] = back[i]
-                tried = False
-                continue
-            if tried or best == zero:
-                best = worst
-            for i in rows:  # `back` is the step of Douglas and Rachford, and `a` holds the equations of Newton's step.
-                x[i] = rhs[i]
-                for j in rows:
-                    x[i] += M[i][j] * ((two * g[j] - u[j]) / tau[j])
-            for i in rows:
-                back[i] = u[i] - g[i]
-                for j in rows:
-                    back[i] += resolvent[i][j] * x[j]
-                for j in rows:
-                    a[i][j] = zero
-                    for k in range(first[j], last[j]):
-                        same = slope = one if k == j else zero
-                        if share[j] < one:
-                            slope = share[j] * (same - normal[k] * normal[j])
-                        if k == i:
-                            a[i][j] += slope
-                        a[i][j] += M[i][k] / tau[k] * (same - slope)
-                a[i][end] = r[i]
-            _eliminated(a, begin, end, x)
-            for i in rows:
-                u[i] -= x[i]
-            tried = True
-        if not solved:
-            for i in rows:
-                for j in rows:
-                    a[i][j] = M[i][j]
-                a[i][end] = rhs[i]
-                g[i] = zero
-            _eliminated(a, begin, end, v)
+        own = slice(begin, end)
+        q_own = _in_order([q[at[own]], *-(M[own, :begin] * v[:begin]).T])
+        spans = dict.fromkeys(zip(first[own] - begin, last[own] - begin, strict=True))
+        vectors = [slice(*span) for span in spans]
+        v[own], f[at[own]] = _block_of_balls(M[own, own], resolvent[own, own], tau[own], limit[own], vectors, q_own)
         begin = end
-    for i in range(m):
-        e[at[i]], f[at[i]] = v[i], g[i]
+    e[at] = v
     return e, f
+
+
+def _block_of_balls(
+    M: Array, resolvent: Array, tau: Array, limit: Array, vectors: Sequence[slice], q: Array
+) -> tuple[Array, Array]:
+    """Solve f = q - M e (n,) for (e, f) in a block of limited `vectors`; f is 0 if no solution is found."""
+    n, real = len(q), q.dtype.type
+    residual, rounding, eye = real(_RESIDUAL), real(_ball_rounding(real is np.float32)), np.eye(n, dtype=real)
+    u = back = q
+    length, tried, best = np.empty_like(q), False, real(0)
+    for _ in range(_MOST_STEPS):
+        for own in vectors:
+            length[own] = np.sqrt(_in_order(u[own] * u[own]))
+        over = length > limit
+        share = np.divide(limit, length, out=np.ones_like(u), where=over)
+        normal = np.divide(u, length, out=np.zeros_like(u), where=over)
+        f = share * u
+        e = (u - f) / tau
+        products = (M * e).T
+        r = _in_order([f - q, *products])
+        size = _in_order([np.abs(f) + np.abs(q), *np.abs(products)]).max()
+        worst = (np.abs(r) / np.maximum(residual * limit, rounding * size)).max()
+        if worst <= 1:
+            return e, f
+        if tried and 2 * worst > best:
+            u, tried = back, False
+            continue
+        if tried or best == 0:
+            best = worst
+        x = _in_order([q, *(M * ((2 * f - u) / tau)).T])
+        back = _in_order([u - f, *(resolvent * x).T])  # the step of Douglas and Rachford
+        slope = np.where(share < 1, share * (eye - np.outer(normal, normal)), eye)  # of f in u, for each vector
+        rows = np.zeros((n, n + 1), real)  # the equations of Newton's step
+        for own in vectors:
+            for k in range(own.start, own.stop):
+                rows[k, own] += slope[k, own]
+                rows[:, own] += np.outer(M[:, k] / tau[k], eye[k, own] - slope[k, own])
+        rows[:, n] = r
+        u, tried = u - _solved(rows, pivoting=True), True
+    return _solved(np.column_stack([M, q]), pivoting=True), np.zeros_like(q)
 
 
 def _ball_rounding(single: bool) -> float:

@@ -217,7 +217,7 @@ def test_unsolved_vectors_are_zero_with_their_slips(space, monkeypatch, psi):
     monkeypatch.setattr(export_module, "_MOST_STEPS", 1)
     unsolved = 0
     for q in rng.normal(size=(100, 4)):
-        e, f = (np.array(part).reshape(2, 2) for part in _balled(table, list(q)))
+        e, f = (np.array(part).reshape(2, 2) for part in _balled(table, q))
         np.testing.assert_allclose(f.ravel(), q - M @ e.ravel(), rtol=0, atol=1e-12)  # rounding of a few newtons
         lengths, slips = np.linalg.norm(f, axis=1), np.linalg.norm(e, axis=1)
         zero, within = (f == 0).all(axis=1), (slips == 0) & (lengths <= limits)
