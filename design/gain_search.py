@@ -102,17 +102,9 @@ class SampledLoop:
         """Return the condition's demand for G and the multiplier mu (active,)."""
         return this_environment_demand(self.loop.late(G), self.loop)
 
-    def block(self, G: Sampled, mu: Array) -> Sampled:
-        """Return the condition's block for the share 1 - _SAMPLED_RESERVE of the damping."""
-        demand = self.demand(G, mu)
-        return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
-
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """Return the multiplier (active,) at x, and its derivative with respect to the unknowns after the gains.
-
-        The derivative is the diagonal (active,) of a diagonal matrix, or a matrix (active, active).
-        """
-        return np.zeros(0), np.zeros(0)
+        """Return the multiplier (active,) at x, and its derivative (active, active) by the unknowns after the gains."""
+        return np.zeros(0), np.zeros((0, 0))
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
         """Return the limiter's multiplier c at x, or None for conditions without a limiter."""
@@ -135,7 +127,8 @@ class SampledLoop:
         columns = np.concatenate([first, self.active, second, second])
 
         def entries(mu: float) -> Complex:
-            H = self.block(response, np.full(self.active.size, mu)).G
+            demand = self.demand(response, np.full(self.active.size, mu))
+            H = (demand.free + demand.gain * (1 - _SAMPLED_RESERVE)).G
             return np.broadcast_to(H, (2, *H.shape[1:]))[:, :, rows, columns]
 
         none, of_G = entries(0)
@@ -179,15 +172,27 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`.
+        """Return the margin of the sampled condition at each frequency (k,).
 
         With delay in the environment `stability` is appended, because the sampled condition does not imply it.
         """
-        room = self._least(x)[0]
+        room = self._margins(x)
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
         """Return the gradient of `room`, with finite differences for the poles."""
+        slope = self._margin_slopes(x)
+        if not any(self.loop.psi):
+            return slope
+        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
+        return np.vstack([slope, [(self.stability(x + step) - at) / _DIFFERENCE for step in steps]])
+
+    def _margins(self, x: Array) -> Array:
+        """Return the least eigenvalue (k,) of the condition's block, in units of delta/T."""
+        return self._least(x)[0]
+
+    def _margin_slopes(self, x: Array) -> Array:
+        """Return the gradient of `_margins`, (k, entries of x)."""
         around, (_, v), (mu, moves) = self._around(x, "conditions"), self._least(x), self.mu(x)
         m, active = self.loop.channels, self.active
         Gv = np.einsum("kij,kj->ki", around.G, v[:, :m])
@@ -203,19 +208,14 @@ class SampledLoop:
             sent = np.concatenate([Gv, Gv[:, active], 0 * v[:, m:], 0 * v[:, m:]], axis=1)
             each = (rows * (of_mu * here + of_both * sent)).real
             by_mu = each[:, active] + sum(np.split(each[:, m:], 3, axis=1))
-            slope.append(by_mu @ moves if moves.ndim > 1 else by_mu * moves)
-        slope = np.concatenate(slope, axis=1)
-        return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
+            slope.append(by_mu @ moves)
+        return np.concatenate(slope, axis=1)
 
     def _spread(self, mu: Array) -> Array:
         """Return mu for each stored entry of the block, (m + 3 active,)."""
         first = np.zeros(self.loop.channels)
         first[self.active] = mu
         return np.concatenate([first, mu, mu, mu])
-
-    def _stability_slope(self, x: Array) -> Array:
-        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
-        return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
         """Return He of the block: upper left (k, m, m), lower left (k, active, m), lower right's diagonal."""
@@ -252,17 +252,17 @@ class SampledLoop:
         """Return x after at most `most` steps towards a local optimum."""
         m = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
-        objective, constraint = (self.square_mismatch, self.square_mismatch_slope), (self.room, self.room_slope)
-        return _slsqp(objective, constraint, x, bounds, most, 1e-7)
+        return _slsqp(self.square_mismatch, self.square_mismatch_slope, self.room, self.room_slope, x, bounds, most)
 
 
-_Differentiable = tuple[Callable[[Array], Any], Callable[[Array], Any]]  # a function and its derivative
+_Function = Callable[[Array], Any]
+_SETTLED = 1e-7  # absolute change of the objective at which SLSQP ends
 
 
 def _slsqp(
-    objective: _Differentiable, constraint: _Differentiable, x: ArrayLike, bounds: Any, most: int, ftol: float
+    f: _Function, slope: _Function, room: _Function, room_slope: _Function, x: ArrayLike, bounds: Any, most: int
 ) -> Array:
-    """Minimise the objective subject to constraint(x) (m,) >= 0 by at most `most` steps of SLSQP; return x (n,).
+    """Minimise f subject to room(x) (m,) >= 0 by at most `most` steps of SLSQP; return x (n,).
 
     With SciPy 1.17 the compiled routine is called in a loop like that of `minimize`, because the import of
     scipy.optimize takes 0.2 s. The routine's state and workspace differ between releases, so with any other release
@@ -270,9 +270,8 @@ def _slsqp(
     """
     import scipy  # slow to load
 
-    (f, slope), (room, room_slope) = objective, constraint
     if not scipy.__version__.startswith("1.17."):
-        condition, options = {"type": "ineq", "fun": room, "jac": room_slope}, {"maxiter": most, "ftol": ftol}
+        condition, options = {"type": "ineq", "fun": room, "jac": room_slope}, {"maxiter": most, "ftol": _SETTLED}
         optimum = scipy.optimize.minimize(
             f, x, jac=slope, bounds=bounds, constraints=condition, method="SLSQP", options=options
         )
@@ -285,7 +284,7 @@ def _slsqp(
     m, n = normals.shape
     state = dict.fromkeys(("alpha", "f0", "gs", "h1", "h2", "h3", "h4", "t", "t0"), 0.0)
     state |= dict.fromkeys(("exact", "inconsistent", "reset", "iter", "line", "meq", "mode"), 0)
-    state |= {"acc": ftol, "tol": 10 * ftol, "itermax": most, "m": m, "n": n}
+    state |= {"acc": _SETTLED, "tol": 10 * _SETTLED, "itermax": most, "m": m, "n": n}
     multipliers, indices = np.zeros(m + 2 * n + 2), np.zeros(m + 2 * n + 2, dtype=np.int32)
     buffer = np.zeros(2 * (n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28))  # twice that of `minimize`
     while True:
@@ -338,8 +337,6 @@ class SwitchingLoop(SampledLoop):
 
     def mu(self, x: Array) -> tuple[Array, Array]:
         logs, unit = x[2 * self.loop.channels :], self.unit[self.active]
-        if self.loop.axes is None:
-            return np.exp(logs) * unit, np.exp(logs) * unit
         shared = self.shared[np.ix_(self.active, self.active)]
         alpha = np.exp(shared @ logs) * unit
         return alpha, alpha[:, None] * shared
@@ -367,7 +364,7 @@ class LimiterLoop(SampledLoop):
 
     def mu(self, x: Array) -> tuple[Array, Array]:
         c = np.maximum(x[2 * self.loop.channels :], 0.0)
-        return (c, np.ones(c.size)) if self.loop.axes is None else (self.shared @ c, self.shared)
+        return self.shared @ c, self.shared
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]]:
         return np.round(self.mu(x)[0][self.lead, None], 6).tolist()
@@ -424,12 +421,11 @@ class KnownDeviceLoop(SampledLoop):
         v = v * self.root
         return values, v, np.einsum("kij,kj->ki", M, v) / (4 * speed)
 
-    def room(self, x: Array) -> Array:
-        room = self._complement(x)[0]
-        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+    def _margins(self, x: Array) -> Array:
+        return self._complement(x)[0]
 
-    def room_slope(self, x: Array) -> Array:
-        """Return the gradient of `room`. The parts for beta and for the poles are finite differences."""
+    def _margin_slopes(self, x: Array) -> Array:
+        """Return the gradient of `_margins`, with finite differences for beta."""
         room, v, below = self._complement(x)
         around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
         left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]
@@ -440,8 +436,7 @@ class KnownDeviceLoop(SampledLoop):
             step = x.copy()
             step[2 * m + i] += _DIFFERENCE
             slope.append(((self._complement(step)[0] - room) / _DIFFERENCE)[:, None])
-        slope = np.concatenate(slope, axis=1)
-        return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
+        return np.concatenate(slope, axis=1)
 
 
 _SAME = 1e-3  # Two results of a search are one local optimum if no entry of x differs by more.
@@ -473,19 +468,13 @@ class Optimum(NamedTuple):
     multiplier: Sequence[Sequence[float]] | None = None
 
 
-def least_rms(
-    sampled: SampledLoop,
-    starts: Iterable[SpringDamper],
-    band_hz: tuple[float, float] = BAND_HZ,
-    before: Optimum = Optimum(),  # noqa: B008 - immutable
-) -> Optimum:
-    """Return the best local optimum that is reached from the starts, or `before` if that is better.
+def least_rms(sampled: SampledLoop, starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ) -> Optimum:
+    """Return the best local optimum that is reached from the starts.
 
     All searches share the frequencies that they add to `sampled`. For more than FEW channels the first optimum is
     returned, because steps are expensive and the start hardly matters.
     """
-    best, loop = before, sampled.loop
-    known = [sampled.point(before.gains)] if before.gains else []
+    best, loop, known = Optimum(), sampled.loop, list[Array]()
     for start in starts:
         x, runs = _optimum(sampled, start, known)
         best = best._replace(searches=best.searches + runs)

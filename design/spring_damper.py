@@ -23,7 +23,6 @@ from haptic_loop.design.conditions import even_damping, even_level, theta_hat, t
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, least_phi, stiffest_alpha
 from haptic_loop.design.facts import Latency, PeriodCost
-from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import on_circle, peaks
 from haptic_loop.design.gain_search import (
     FEW,
@@ -300,12 +299,16 @@ def _for_this_environment(loop: Loop, limiter: bool | None, band_hz: tuple[float
     many = loop.channels > FEW
     if many:
         starts = likeliest_first(sampled, starts)
-    if limiter is False:
+    linear = best = Optimum()
+    if limiter is False or not many:
         linear = best = least_rms(sampled, starts, band)
-    elif many:
-        linear, best = Optimum(), least_rms(LimiterLoop(loop, band), starts, band)
-    else:
-        linear, best = _limited(sampled, starts, band)
+    if limiter is not False and (many or linear.gains):
+        limited = LimiterLoop(loop, band)
+        # Limits soften the gains only a little, so the search begins with the gains without limits, if there are any.
+        best = least_rms(limited, [linear.gains] if linear.gains else starts, band)
+        if linear.gains and not best.gains:
+            best = least_rms(limited, starts, band)
+        best = best._replace(searches=linear.searches + best.searches)
     if limiter is None and not best.gains:
         best = least_rms(sampled, starts, band) if many else linear
     if best.gains is None:
@@ -327,31 +330,6 @@ def _no_gains(loop: Loop, certifies: str) -> DesignFailed:
     """Return the error of a search without result; `certifies` names the condition, with a verb."""
     which = f"theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
     return DesignFailed(None, (), f"no spring-damper was found that {certifies} for {which}")
-
-
-def _limited(
-    sampled: SampledLoop, starts: Sequence[SpringDamper], band: tuple[float, float]
-) -> tuple[Optimum, Optimum]:
-    """Return the best gains without limits, and those for limited forces.
-
-    The search for limited forces starts at the gains without limits, because limits soften them only a little. It
-    begins from the result of the first start while a second process searches from the others, which are rarely better.
-    """
-    first = least_rms(sampled, starts[:1], band)
-    others = Forked(least_rms, sampled, starts[1:], band, first)
-    limited, best = None, Optimum()
-    if others.begun and first.gains:
-        limited = LimiterLoop(sampled.loop, band)
-        best = least_rms(limited, [first.gains], band)
-    linear = others.result()
-    if not linear.gains:
-        return linear, linear
-    if limited is None or linear.rms < first.rms:
-        limited = LimiterLoop(sampled.loop, band)
-        best = least_rms(limited, [linear.gains], band)
-    if not best.gains:
-        best = least_rms(limited, starts, band)
-    return linear, best._replace(searches=linear.searches + best.searches)
 
 
 def _for_known_devices(loop: Loop, band_hz: tuple[float, float] | None) -> Design:

@@ -2,7 +2,6 @@
 
 import os
 import signal
-from pathlib import Path
 
 import pytest
 
@@ -10,10 +9,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design import forked
 from haptic_loop.design.audit import audit
 from haptic_loop.design.forked import Forked
-from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
-
-LOOPS = Path(__file__).parents[2] / "benchmarks/loops"
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2, reason="needs Linux and two processors"
@@ -64,13 +60,3 @@ def test_an_audit_is_the_same_with_one_process(monkeypatch):
     alone = audit(loop, coupling)
     for part in ("margins", "helps", "constant"):
         assert getattr(both, part) == getattr(alone, part)
-
-
-@pytest.mark.parametrize("name", ["omega-pair", LOOPS / "o06-chain-of-three-masses.toml"], ids=["first", "another"])
-def test_gains_are_the_same_with_one_process(name, monkeypatch):
-    """The gains come from the first start or, for the chain, from another one."""
-    loop = load(name).loop("I")
-    both = design(loop, "this-environment")
-    monkeypatch.setattr(forked, "allowed", False)
-    alone = design(loop, "this-environment")
-    assert (both.coupling.form(), both.c, both.sdps) == (alone.coupling.form(), alone.c, alone.sdps)

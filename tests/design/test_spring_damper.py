@@ -363,7 +363,7 @@ def test_slsqp_equals_that_of_scipy(monkeypatch, release, steps):
     public = minimize(rosen, start, jac=rosen_der, method="SLSQP", bounds=bounds, constraints=disc, options=options)
     assert public.success is (steps > 7)
     monkeypatch.setattr(scipy, "__version__", release)
-    own = gain_search._slsqp((rosen, rosen_der), (disc["fun"], disc["jac"]), start, bounds, steps, 1e-7)
+    own = gain_search._slsqp(rosen, rosen_der, disc["fun"], disc["jac"], start, bounds, steps)
     assert own.tolist() == public.x.tolist()
 
 
