@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import io
 import os
 import signal
@@ -129,7 +128,8 @@ def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__un
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         shown(unraisable)
         return
-    timer = threading.Timer(_MOMENT, _thread.interrupt_main)
+    # Unlike _thread.interrupt_main, a signal also ends a call in which the main thread waits.
+    timer = threading.Timer(_MOMENT, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.daemon = True
     timer.start()
 
