@@ -83,7 +83,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError unless 0 <= phi < Delta_D T/T_max.
     """
     T, damping = V.T, even_damping(loop, V.T)
-    shortage = numbers([0] * loop.channels if phi is None else phi, T)
+    shortage = numbers([0] * loop.channels if phi is None or not len(phi) else phi, T)
     level = even_level(loop, T) if loop.levels else damping
     below = len(shortage) == len(damping) and ((shortage >= 0) & (shortage < damping)).all()
     if not below or (loop.levels and not positive_definite(level - np.diag(shortage))):

@@ -15,7 +15,7 @@ from haptic_loop.controller.arithmetic import SingularLoop, positive_definite
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Block, Lti, Sampled
+from haptic_loop.controller.lti import Array, Block, Lti
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import (
@@ -42,7 +42,6 @@ from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.facts import (
     Demand,
     Fact,
-    HandsSide,
     Limited,
     Switching,
     Unknowns,
@@ -97,8 +96,12 @@ class Multiplied(Condition):
         """Return the map G of `block`. Raises SingularLoop; if `exact`, TooLong for a map too large to be proved."""
 
     @abstractmethod
-    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """Return the block of a map G, in any arithmetic."""
+    def block(self, G: Block, loop: Loop, multiplier: Any = None, scaled: bool = False) -> Demand[Block]:
+        """Return the block of a map G, in any arithmetic.
+
+        If `scaled`, `multiplier` holds s times the multipliers of the hands' side, so that the block is affine in s and
+        in all numbers of `multiplier`.
+        """
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
         """Return the facts of this loop beyond a linear network with constant delays."""
@@ -111,15 +114,6 @@ class Multiplied(Condition):
         """Return the first multiplier of a search; blocks too large for a search use it unchanged."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
-    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return the block, affine in s and in `multiplier`, which holds s times the multipliers of the hands' side."""
-        return self.block(G, loop, multiplier)
-
-    def hands(self, loop: Loop) -> HandsSide | None:
-        """Return the hands' side whose multipliers are among the unknowns, or None."""
-        hands = hands_side(loop)
-        return hands if hands.unknowns(loop) else None
-
     def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
         """Return the multipliers by name. Raises ValueError for a wrong number of values."""
         return named_parts(self.unknowns(loop), multiplier)
@@ -129,7 +123,7 @@ class Multiplied(Condition):
         values = self.named(loop, multiplier)
         for each in self.unknowns(loop):
             each.check(values[each.name])
-        if (hands := self.hands(loop)) and (reason := hands.excess(loop, values)):
+        if reason := hands_side(loop).excess(loop, values):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
@@ -183,16 +177,11 @@ def named_parts(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> dict[str
     names = [each.name for each in unknowns]
     if len(set(names)) < len(names):
         raise ValueError(f"two multipliers have one name: {', '.join(names)}")
-    return {each.name: part for each, part in zip(unknowns, _parted(unknowns, values), strict=True)}
-
-
-def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequence[Any]]:
-    """Return the values of each multiplier. Raises ValueError for a wrong number of values."""
     ends = np.cumsum([0, *(len(each.units) for each in unknowns)]).tolist()
     if ends[-1] != len(values):
         expected = "; ".join(f"{each.name}: {each.expected}" for each in unknowns)
         raise ValueError(f"the multipliers have {len(values)} numbers, expected {ends[-1]} ({expected})")
-    return [values[a:b] for a, b in pairwise(ends)]
+    return {name: values[a:b] for name, (a, b) in zip(names, pairwise(ends), strict=True)}
 
 
 _MOST_PEAKS = 3  # largest number of local maxima (`peaks`) whose frequencies are added in a round
@@ -207,8 +196,7 @@ class _Search:
 
     def __init__(self, condition: Multiplied, G: Lti, loop: Loop, demand: Demand[Lti]) -> None:
         system, self._block, unknowns = demand.free, partial(condition.block, G, loop), condition.unknowns(loop)
-        self._scaled, self._named = partial(condition.scaled, G, loop), partial(condition.named, loop)
-        self._hands, self._loop = condition.hands(loop), loop
+        self._named, self._hands, self._loop = partial(condition.named, loop), hands_side(loop), loop
         self._names = ", ".join(each.name for each in unknowns)
         self._units = np.array([unit for each in unknowns for unit in each.units])
         self._searched = np.flatnonzero(self._units)  # The other numbers are always 0.
@@ -232,7 +220,7 @@ class _Search:
         """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`)."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
-        self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
+        self._plain = [self._block(tuple(x), scaled=True) for x in (0 * self._units, *units)]
         constant, by = (
             np.abs(np.diagonal(part, axis1=-2, axis2=-1)).max(axis=-2) for part in self._parts(self._grid[[0, -1]])
         )
@@ -259,8 +247,6 @@ class _Search:
 
     def _rooms(self, count: int) -> list[Inequality]:
         """Return the inequalities for the multipliers of the hands' side, in the unknowns of the search and s."""
-        if self._hands is None:
-            return []
         hands, values = self._hands, np.zeros(self._units.size)
 
         def room(j: int, x: Array) -> Array:
@@ -278,13 +264,9 @@ class _Search:
         values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
-        if not self._hands:
-            return tuple(values.tolist())
-        values_by_name = self._named(values.tolist())
-        own = {each.name for each in self._hands.unknowns(self._loop)}
-        parts = {
-            name: [v / max(s, _NOTHING) for v in part] if name in own else part for name, part in values_by_name.items()
-        }
+        parts = self._named(values.tolist())
+        for each in self._hands.unknowns(self._loop):
+            parts[each.name] = [v / max(s, _NOTHING) for v in parts[each.name]]
         return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
@@ -338,19 +320,16 @@ class ThisEnvironment(Multiplied):
         alpha (`Switching`) is half the width of a device's range of delays times the largest gain of the map G from its
         displacement to its force. With more than MULTIPLIER_ROWS/2 channels it is the best of _SHARES times this value.
         """
-        unknowns, usual = self.unknowns(loop), super().usual(G, loop)
+        usual = super().usual(G, loop)
         if not loop.varying_delay or G is None:
             return usual
         w, m = frequencies(G, points=60), loop.channels
         most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w))[:, :m, :m], axis1=1, axis2=2)).max(axis=0)
-        others = [
-            () if each.name == "alpha" else part for each, part in zip(unknowns, _parted(unknowns, usual), strict=True)
-        ]
-        units = next(each.units for each in unknowns if each.name == "alpha")
-        tried = []
+        values, tried = self.named(loop, usual), []
+        least = 1e-8 * np.array(values["alpha"])
         for share in _SHARES if 2 * m > budgets.MULTIPLIER_ROWS else (1.0,):
-            alpha = np.maximum(share * -loop.per_device(-most), 1e-8 * np.array(units)).tolist()
-            tried.append([v for part in others for v in (part or alpha)])
+            values["alpha"] = np.maximum(share * -loop.per_device(-most), least).tolist()
+            tried.append([v for part in values.values() for v in part])
         return min(tried, key=lambda values: float(least_scale(self.block(G, loop, values), w).max()))
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
@@ -359,14 +338,7 @@ class ThisEnvironment(Multiplied):
             budgets.require_size(G.order + sum(loop.delays.hi))
         return G
 
-    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """Return the block of a map G as in design.facts.compose, with its multipliers in one sequence."""
-        return self._composed(G, loop, multiplier)
-
-    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        return self._composed(G, loop, multiplier, scaled=True)
-
-    def _composed(self, G: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
+    def block(self, G: Block, loop: Loop, multiplier: Any = None, scaled: bool = False) -> Demand[Block]:
         values = self.named(loop, () if multiplier is None else multiplier)
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
@@ -694,17 +666,11 @@ class _AnyEnvironment(Multiplied):
             budgets.require_size(V.order + sum(loop.delays.hi))
         return V
 
-    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        return self._composed(G, loop, multiplier)
-
-    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        return self._composed(G, loop, multiplier, scaled=True)
-
-    def _composed(self, V: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
+    def block(self, G: Block, loop: Loop, multiplier: Any = None, scaled: bool = False) -> Demand[Block]:
         if not self._in_frame(loop):
-            return any_environment_demand(V, loop)
+            return any_environment_demand(G, loop, multiplier)
         values = self.named(loop, () if multiplier is None else multiplier)
-        return compose_any(V, loop, self.facts(loop), values, scaled)
+        return compose_any(G, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         if (reason := self.beyond(loop)) or not any(loop.psi):
@@ -729,23 +695,17 @@ class _AnyEnvironment(Multiplied):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
-        if V is not None and self._in_frame(loop):
-            return partial(least_scale, self.block(V, loop, multiplier or self.usual(None, loop)))
-        phi = multiplier if any(loop.psi) else None
-        if V is None or (phi is None and any(loop.psi)):
+        if V is None or (multiplier is None and any(loop.psi)):
             return None
-        return partial(least_scale, any_environment_demand(V, loop, phi))
+        return partial(least_scale, self.block(V, loop, self.usual(None, loop) if multiplier is None else multiplier))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        """Return the ratios (n,) of `Condition`; for None with the first multiplier of a search."""
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
-
-        def demand(V: Sampled) -> Demand[Sampled]:
-            """Return the block, with default multipliers for a latency that varies and for switching delays."""
-            if self._in_frame(loop):
-                return self.block(V, loop, self.usual(None, loop))
-            return any_environment_demand(V, loop, multiplier)
-
-        return any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, demand)
+        values = self.usual(None, loop) if multiplier is None else multiplier
+        return any_environment_ratios(
+            lambda z: coupling.sampled(z, loop.T), count, loop, lambda V: self.block(V, loop, values)
+        )
 
     def _without(self, coupling: Coupling) -> str:
         if coupling.holds_model:
@@ -774,22 +734,14 @@ class _AnyEnvironment(Multiplied):
         return replace(requirement, multiplier=tuple(multiplier))
 
     def _composed_requirement(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
-        if self.unknowns(loop):
-            needs = self.required_of(V, loop, multiplier)
-            if multiplier or loop.latency or needs.certified or self._extended:
-                return needs
-            spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
-            mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
-            alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
-            closed = self.required_of(V, loop, alpha)  # The search may miss this alpha near the stiffest coupling.
-            return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
-        demand = self.block(V, loop)
-        if not V.is_stable():
-            return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
-        if reason := unsound(demand.free, loop.delta) or self.unsound_static(V, loop, demand):
-            return refusal(self.name, loop.delta, reason)
-        ratio, w = supremum(partial(least_scale, demand), np.concatenate([[0.0], frequencies(V)]))
-        return from_ratio(self.name, ratio, loop.delta, w / (2 * np.pi * loop.T))
+        needs = self.required_of(V, loop, multiplier)
+        if multiplier or loop.latency or needs.certified or self._extended:
+            return needs
+        spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
+        mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
+        alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
+        closed = self.required_of(V, loop, alpha)  # The search may miss this alpha near the stiffest coupling.
+        return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
 
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         return asymmetric(demand.static["V(1)"])
@@ -803,7 +755,7 @@ class _AnyEnvironment(Multiplied):
         budgets.require_size(V.order + sum(loop.theta))
         delayed = delay(loop.psi, T) @ loop.E(exact=True)
         return {
-            "P": any_environment_demand(V, loop, multiplier),
+            "P": self.block(V, loop, multiplier),
             "P_E": delayed_environment_demand(delayed, multiplier),
         }
 

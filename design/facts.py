@@ -462,7 +462,7 @@ class Latency(HandsSide):
         return bounds
 
     def allowed(self, loop: Loop, values: Values) -> Values:
-        shrunk = {name: list(values[name]) for name in ("q11", "q12", "q22")}
+        shrunk = {name: list(part) for name, part in values.items()}
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _CLOSER)
             D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
@@ -473,9 +473,9 @@ class Latency(HandsSide):
                     break
             else:
                 entries = [*_separate(loop, d)[:1], 0.0, *_separate(loop, d)[1:]]
-            for name, entry in zip(shrunk, entries, strict=True):
+            for name, entry in zip(("q11", "q12", "q22"), entries, strict=True):
                 shrunk[name][d] = entry
-        return {**values, **shrunk}
+        return shrunk
 
     def excess(self, loop: Loop, values: Values) -> str | None:
         for d in _varies(loop):

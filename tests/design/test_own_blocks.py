@@ -33,7 +33,7 @@ class PerWall(Multiplied):
     def map(self, loop, coupling, exact=False):
         return loop.F(coupling, exact)
 
-    def block(self, G, loop, multiplier=None):
+    def block(self, G, loop, multiplier=None, scaled=False):
         return this_environment_demand(G, loop)
 
 
@@ -118,7 +118,7 @@ class Wide(Scaled):
 class Empty(PerWall):
     name = "empty"
 
-    def block(self, G, loop, multiplier=None):
+    def block(self, G, loop, multiplier=None, scaled=False):
         return None
 
 
