@@ -15,13 +15,13 @@ from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
+from haptic_loop.design.coverage import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.program import OBJECTIVES, Options
 from haptic_loop.design.result import Design, finite, listed
-from haptic_loop.design.robustness import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # loaded only by commands that need them
     from rich.table import Table
 
     from haptic_loop.cli.screen import Screen
-    from haptic_loop.design.robustness import Robustness
+    from haptic_loop.design.coverage import Robustness
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 

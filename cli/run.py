@@ -29,7 +29,7 @@ from haptic_loop.sim.shown import Contacts, Onset, Signals
 if TYPE_CHECKING:
     from haptic_loop.controller.budget import BudgetFigures
     from haptic_loop.design.assessment import Assessment
-    from haptic_loop.design.robustness import Robustness
+    from haptic_loop.design.coverage import Robustness
     from haptic_loop.sim.api import ScenarioRun
     from haptic_loop.sim.report import PaperRow
     from haptic_loop.sim.run_report import Ran, RunReport
@@ -162,7 +162,7 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robustness | None] | None:
     """Begin to compute the damping needed in environments near the model; None if no guarantee depends on the model."""
-    from haptic_loop.design.robustness import robustness_nearby
+    from haptic_loop.design.coverage import robustness_nearby
 
     guarantee = assessment.guarantee
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:

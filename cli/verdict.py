@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from haptic_loop.cli import render
 from haptic_loop.controller.environment import RIGID_WALL, Environment
 from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult
+from haptic_loop.design.coverage import Robustness
 from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
-from haptic_loop.design.robustness import Robustness
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.scenario import Scenario

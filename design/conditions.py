@@ -268,8 +268,8 @@ class Condition(ABC):
             requirement = refusal(self.name, loop.delta, str(error))
         return replace(requirement, guarantee=self.words(loop), limiter_rho=self.limiter_rho(loop))
 
-    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-        """Return required over available damping; `thin` allows a sweep over every thin-th frequency only."""
+    def ratio(self, loop: Loop, coupling: Coupling) -> float:
+        """Return required over available damping."""
         return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
@@ -429,14 +429,17 @@ def this_environment(F: Lti, loop: Loop) -> Requirement:
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
-def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-    """Return required over available damping of this-environment for a stable coupling, by a refined sweep.
+def ratio_in(loop: Loop, coupling: Coupling) -> float:
+    """Return required over available damping of this-environment for a stable coupling; inf for a singular loop.
 
-    With `thin` > 1 the sweep is not refined and uses every `thin`-th frequency of its grid. The responses of a force
-    filter and of the environment are multiplied, because the poles of their series are defective.
+    The responses of a force filter and of the environment are multiplied, because the poles of their series are
+    defective.
     """
     if (chain := coupling.in_series(loop.T)) is None:
-        return _by_force_map(loop, coupling, thin)
+        try:
+            return this_environment(loop.F(coupling), loop).ratio
+        except SingularLoop:
+            return np.inf
     E = loop.E()
     delayed = delay(loop.psi, loop.T) @ E
 
@@ -445,20 +448,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         demand = this_environment_demand(F, loop)
         return _least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
-    grid = frequencies(E, chain, low=_LOWEST)
-    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
-
-
-def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """Return required over available damping of this-environment from the force map; inf if unstable or singular."""
-    try:
-        F = loop.F(coupling)
-        if thin == 1:
-            return this_environment(F, loop).ratio
-        demand = this_environment_demand(F, loop)
-    except SingularLoop:
-        return np.inf
-    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
+    return supremum(needed, frequencies(E, chain, low=_LOWEST))[0]
 
 
 _LOWEST = 1e-6  # [rad/sample] Responses are constant below this frequency.

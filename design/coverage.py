@@ -1,4 +1,4 @@
-"""Compute the figures of reports: requirements under switching delays, requirements and mismatches over ranges."""
+"""Compute figures of reports: requirements for switching delays, over ranges, and in environments nearby."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+import msgspec
+
 from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.ranges import Member
+from haptic_loop.controller.ranges import Member, Ranges, UncertainSpring
 from haptic_loop.design.certificate import judged
-from haptic_loop.design.conditions import this_environment
+from haptic_loop.design.conditions import Condition, this_environment
 from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
-from haptic_loop.design.result import Design, DesignFailed, Requirement, suffices
+from haptic_loop.design.result import ANY, Design, DesignFailed, Requirement, suffices
 from haptic_loop.design.transparency import decibels, transparency
 
 _NOT_COVERED = (
@@ -111,3 +114,79 @@ def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Desig
             couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]
+
+
+# ----------------------------------------------------------------------------------------------------
+# Robustness: the damping that a coupling requires in environments near the environment of its design.
+
+
+_PERCENT = 10.0  # change of a parameter in reports
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """The worst requirement of a coupling in the nominal environment and with one parameter changed by `percent`."""
+
+    percent: float
+    required_over_available: float  # required over available damping in the worst environment
+    where: str  # the parameter that differs in the worst environment, with its sign, or "nominal"
+    certified: bool  # whether the condition holds in the worst environment
+
+
+def _nearby(network: Network) -> dict[str, Network]:
+    """Return networks by name, each with one spring, all springs or one mass changed by plus or minus _PERCENT.
+
+    Raises ValueError if a changed stiffness or mass would exceed the largest that a network may have.
+    """
+    changed = {}
+    stiff = [i for i, spring in enumerate(network.springs) if spring.stiffness > 0]
+    for sign, factor in (("+", 1 + _PERCENT / 100), ("-", 1 - _PERCENT / 100)):
+
+        def stiffer(which: Sequence[int], factor: float = factor) -> Network:
+            springs = [
+                msgspec.structs.replace(spring, stiffness=spring.stiffness * factor) if i in which else spring
+                for i, spring in enumerate(network.springs)
+            ]
+            return msgspec.structs.replace(network, springs=tuple(springs))
+
+        for i in stiff:
+            ends = network.springs[i].between
+            alike = [j for j in stiff if network.springs[j].between == ends]
+            which = f", spring {alike.index(i) + 1} of {len(alike)}" if len(alike) > 1 else ""
+            changed[f"{sign}{_PERCENT:g} % stiffness between {' and '.join(ends)}{which}"] = stiffer([i])
+        if len(stiff) > 1:
+            changed[f"{sign}{_PERCENT:g} % stiffness of all springs"] = stiffer(stiff)
+        for node, mass in network.masses.items():
+            if mass > 0:
+                masses = {**network.masses, node: mass * factor}
+                changed[f"{sign}{_PERCENT:g} % mass of {node}"] = msgspec.structs.replace(network, masses=masses)
+    return changed
+
+
+def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
+    """Return the worst requirement of `condition` in the environment and near it, or None if this does not apply.
+
+    It applies to networks without walls and blocks E(z), whose values may be increased by ten percent. The condition
+    must cover the loop, be evaluated for varied loops (`not_varied`), and not hold in any environment.
+    """
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
+        return None
+    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
+        return None
+    try:
+        networks = {"nominal": loop.environment, **_nearby(loop.network)}
+    except ValueError:
+        return None
+    ratios = {name: condition.ratio(loop.at(network), coupling) for name, network in networks.items()}
+    where = max(ratios, key=lambda name: ratios[name])
+    return Robustness(_PERCENT, ratios[where], where, suffices(ratios[where]))
+
+
+def ranges_around(network: Network, percent: float) -> Ranges:
+    """Return ranges in which every stiffness and every mass varies by `percent`, independently of the others."""
+
+    def near(value: float) -> tuple[float, float]:
+        return tuple(float(f"{value * (1 + sign * percent / 100):.12g}") for sign in (-1, 1))  # type: ignore[return-value]
+
+    springs = tuple(UncertainSpring(s.between, near(s.stiffness)) for s in network.springs if s.stiffness > 0)
+    return Ranges(springs, {node: near(mass) for node, mass in network.masses.items() if mass > 0})

@@ -397,9 +397,9 @@ class ThisEnvironment(Multiplied):
                 return f"{name} has a negative direction: it pushes outwards"
         return None
 
-    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+    def ratio(self, loop: Loop, coupling: Coupling) -> float:
         quick = self.extensible and not loop.varying_delay  # `ratio_in` ignores delays that switch.
-        return ratio_in(loop, coupling, thin) if quick else super().ratio(loop, coupling, thin)
+        return ratio_in(loop, coupling) if quick else super().ratio(loop, coupling)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Return the ratios (n,) of `Condition` for constant delays and touching walls; None for a subclass."""

@@ -76,16 +76,15 @@ def search(
     regions: Sequence[Region],
     ratio: _Ratio,
     progress: Progress = lambda done, total: None,
-    work: float = budgets.RANGES,
     over: Callable[[], bool] = lambda: False,
 ) -> Searched:
     """Find the members of the regions at which `ratio` is largest.
 
-    The search ends early when `work` units of counted work are done, or when `over` returns True because the user's
-    time limit has passed. The result then contains the maxima among the members that were tried.
+    The search ends early when its budget of counted work is spent, or when `over` returns True because the user's time
+    limit has passed. The result then contains the maxima among the members that were tried.
     """
     ended: Literal["work", "clock"] | None = None
-    until = spent_after(work)
+    until = spent_after(budgets.RANGES)
     points = [list(_points(region)) for region in regions]
     refinements = [
         min(budgets.RANGE_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)

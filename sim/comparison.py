@@ -19,9 +19,9 @@ from haptic_loop.design import compare
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coverage import Robustness, robustness_nearby
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import Chosen, Requirement, finite
-from haptic_loop.design.robustness import Robustness, robustness_nearby
 from haptic_loop.design.transparency import decibels, transparency
 from haptic_loop.sim.accuracy import credible, force_error
 from haptic_loop.sim.couplings import assessed, choose

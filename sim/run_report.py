@@ -8,9 +8,9 @@ from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
+from haptic_loop.design.coverage import Robustness
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import ANY, MAKING, Chosen
-from haptic_loop.design.robustness import Robustness
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun
 from haptic_loop.sim.passivity_layer import idle

@@ -21,9 +21,9 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from haptic_loop.design.bound import MOST, bound
+from haptic_loop.design.coverage import robustness_nearby
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
-from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.scenario import load
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def _row(path: Path, most: int, limited: int) -> None:
     held = design(loop, replace(PATIENT, limiter=True)) if loop.channels <= limited else None
     shown = f"{held.figures.rms_mismatch_db:8.2f}" if held and held.proved else ""
     figures = found.figures
-    nearby = robustness(loop, found.coupling).required_over_available
+    nearby = robustness_nearby(loop, found.coupling).required_over_available
     print(
         f"{path.stem:28} {before:>8} {beat:>13} {figures.rms_mismatch_db:7.2f} {found.g:6.3f} {limit:>7}"
         f" {seconds:5.1f} {found.states:6} {'yes' if found.proved else 'no':>6} {found.requirement.ratio:7.4f}"

@@ -23,9 +23,9 @@ from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
+from haptic_loop.design.coverage import ranges_around
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, ThisEnvironment
 from haptic_loop.design.result import HERE, RANGES, Chosen, Design, NotProved, listed
-from haptic_loop.design.robustness import ranges_around
 from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given

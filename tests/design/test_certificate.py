@@ -29,11 +29,11 @@ from haptic_loop.design import budgets, environments, spring_damper
 from haptic_loop.design import certificate as design_certificate
 from haptic_loop.design.certificate import Verdict, prove, proves, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.coverage import ranges_around
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.result import ANY, HERE, NotProved, from_ratio
-from haptic_loop.design.robustness import ranges_around
 from haptic_loop.sim.scenario import load as scenario
 from tests.checks.random_loops import proofs
 

@@ -17,11 +17,11 @@ from haptic_loop.design.assessment import _covered_limits, assess
 from haptic_loop.design.certificate import limiter_rho, prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import BEYOND, Condition, Demand
 from haptic_loop.design.coupling_file import Stored, filed, sealed
+from haptic_loop.design.coverage import robustness_nearby
 from haptic_loop.design.environments import SWITCHING, SwitchingDelays
 from haptic_loop.design.facts import Fact
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import ANY, HERE, RANGES, NotProved
-from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
 PAIR = load("omega-pair").loop("I")
@@ -206,7 +206,7 @@ def test_an_own_fact_is_proved_and_mapped(repeats):
     binding = judged.requirements[own.name]
     w = 2 * np.pi * PAIR.T * np.array([binding.frequency_hz])
     assert judged.demands[own.name](w)[0] == pytest.approx(binding.ratio, rel=1e-9)  # with the search's multiplier
-    nearby, plain = robustness(PAIR, SOFT, condition=own), robustness(PAIR, SOFT)
+    nearby, plain = robustness_nearby(PAIR, SOFT, own), robustness_nearby(PAIR, SOFT)
     assert nearby.required_over_available > plain.required_over_available
 
 

@@ -18,11 +18,11 @@ from haptic_loop.design.assessment import BELOW_LIMITS, assess
 from haptic_loop.design.certificate import covered, prove, required_damping, verify
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import Stored, save, sealed
+from haptic_loop.design.coverage import robustness_nearby
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, LimitedForces, SwitchingDelays, ThisEnvironment
 from haptic_loop.design.facts import Fact, Switching, Unknowns
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice
 from haptic_loop.design.result import ANY, HERE, RANGES
-from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.couplings import encoder_steps
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
@@ -126,7 +126,9 @@ def test_maps_and_variations_keep_an_own_fact():
     ):
         plain = sweep.ratios("this-environment", K, B)
         np.testing.assert_allclose(sweep.ratios("twenty", K, B), plain + extra, rtol=1e-6)
-    nearby, plain = (robustness(PAIR, SOFT, each).required_over_available for each in (Twenty(), ThisEnvironment()))
+    nearby, plain = (
+        robustness_nearby(PAIR, SOFT, each).required_over_available for each in (Twenty(), ThisEnvironment())
+    )
     assert nearby == pytest.approx(plain + extra, rel=1e-6)
     ranges = load("omega-pair-ranges").loop("I")
     needs, plain = (required_damping(ranges, SOFT, each).ratio for each in (Twenty(), "this-environment"))

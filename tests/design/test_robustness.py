@@ -11,8 +11,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.compare import judge
-from haptic_loop.design.coverage import OverRanges
-from haptic_loop.design.robustness import robustness_nearby
+from haptic_loop.design.coverage import OverRanges, robustness_nearby
 
 K, T, DELTA = 400.0, 1e-3, 1.0
 SPRING = Network(("tip",), (Spring(("tip", "ground"), K),))

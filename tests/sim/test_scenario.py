@@ -9,8 +9,8 @@ from shared import FIGURE_4
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
 from haptic_loop.controller.loop import DeviceBounds
+from haptic_loop.design.coverage import robustness_nearby
 from haptic_loop.design.designs import design_by_kind
-from haptic_loop.design.robustness import robustness_nearby, vertices
 from haptic_loop.design.transparency import transparency
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link
@@ -353,8 +353,6 @@ def test_too_long_hands_are_refused():
 
 def test_the_stiffest_spring_has_no_stiffer_vertex():
     network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 1e12),))
-    with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed"):
-        vertices(network)
     stiffest = load("one-wall").replace(environment=network)
     assert robustness_nearby(stiffest.loop("I"), SpringDamper([2000.0], [2.0])) is None
 
