@@ -120,8 +120,8 @@ class Collected(Generic[Block]):
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
         self._into: list[tuple[int, int, _Weights]] = []  # (output of the inputs' filter, input, weights)
         self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to the response
-        self._sums: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of f_e, scale)
-        self._steps: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of the steps of f_e, scale)
+        self._sums: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of f_e)
+        self._steps: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of the steps of f_e)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, whether y, not its steps)
         self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
@@ -194,11 +194,11 @@ class Collected(Generic[Block]):
 
     def sums(self, row: int, channel: int, weights: _Weights) -> None:
         """Add the weighted sent force to a row. The force sums up its steps, so the row has a pole at z = 1."""
-        self._sums.append((row, channel, weights, 1))
+        self._sums.append((row, channel, weights))
 
-    def steps(self, row: int, channel: int, weights: _Weights, scale: Any = 1) -> None:
+    def steps(self, row: int, channel: int, weights: _Weights) -> None:
         """Add the weighted steps of the sent force to a row."""
-        self._steps.append((row, channel, weights, scale))
+        self._steps.append((row, channel, weights))
 
     def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
         """Add to a row the weighted steps of the displacement y across a wall, or y itself if `summed`."""
@@ -237,16 +237,15 @@ class Collected(Generic[Block]):
     def gain(self) -> Any:
         return self._matrix(self._gain)
 
-    def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, _Weights]]]:
-        """Return (row, scale, whether the force is summed) of each term with forces, and its (channel, weights)."""
-        kinds = [*((r, True) for r in self._sums), *((r, False) for r in self._steps)]
-        return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
-
-    def _bank(self, reads: Sequence[tuple[int, _Weights]]) -> Lti:
-        """Return the block from sent forces (m,) to the weighted forces, with one delay line per channel."""
-        order = sorted(range(len(reads)), key=lambda r: reads[r][0])
-        parts = [_taps([w for c, w in reads if c == channel], self.T) for channel in range(self.channels)]
-        return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
+    def _bank(self) -> Lti:
+        """Return the block from sent forces (m,) to all weighted forces, with one delay line per channel."""
+        reads = [*self._sums, *self._steps]
+        order, parts = [], []
+        for channel in range(self.channels):
+            own = [r for r, (_, c, _) in enumerate(reads) if c == channel]
+            parts.append(_of_weights([(i, 0, reads[r][2]) for i, r in enumerate(own)], len(own), 1, self.T))
+            order += own
+        return Lti.diag(*parts).rows(np.argsort(order))
 
     def _filter(self) -> tuple[Lti, list[int]]:
         """Return (block from inputs to [dx; steps of walls' forces; steps added to f_e; late inputs], late inputs)."""
@@ -265,19 +264,13 @@ class Collected(Generic[Block]):
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
-        rows, reads = self._reads()
-        bank = self._bank(reads)
-        follows = len(reads)
+        bank = self._bank()
+        follows = bank.outputs
         # The signals are weighted forces, displacements across walls, and inputs of the previous tick.
         inner = m + w  # outputs of G
         rest = m + len(late)  # outputs of the filter that bypass G
-        mix: Any = numbers(np.zeros((m + w + len(late), inner + rest), dtype=int), T) + 0
-        for i in range(m):
-            mix[i, i] = mix[i, inner + i] = 1
-        for j in range(w):
-            mix[m + j, m + j] = 1
-        for j in range(len(late)):
-            mix[m + w + j, inner + m + j] = 1
+        one = np.eye(inner + len(late), dtype=int)
+        mix = numbers(np.hstack([one[:, :inner], one[:, :m], one[:, inner:]]), T)
         lines = Lti.diag(bank, Lti.constant(np.eye(w + len(late), dtype=int), T)) @ mix
         if isinstance(G, Sampled):
             filtered = Sampled(G.z, into.at(G.z), G.T)
@@ -290,9 +283,9 @@ class Collected(Generic[Block]):
         count = signals.G.shape[-2] if isinstance(signals, Sampled) else signals.outputs
         sums: Any = numbers(np.zeros((n, count), dtype=int), T) + 0
         steps: Any = sums + 0
-        for r, (row, scale, summed) in enumerate(rows):
-            target = sums if summed else steps
-            target[row, r] = target[row, r] + scale
+        for r, (row, _, _) in enumerate([*self._sums, *self._steps]):
+            target = sums if r < len(self._sums) else steps
+            target[row, r] = 1
         for row, wall, weight, summed in self._walls:
             target = sums if summed else steps
             target[row, follows + wall] = target[row, follows + wall] + weight
@@ -301,18 +294,6 @@ class Collected(Generic[Block]):
             steps[row, place] = steps[row, place] + weight
         free = np.hstack([sums, steps]) @ vstack(regular, signals) + self._matrix(self._terms)
         return times(sums, static), free, self.gain()
-
-
-def _taps(rows: Sequence[_Weights], T: Number) -> Lti:
-    """Return the block from one channel to w_0 + w_1/z + .. for each row, with one delay line."""
-    n = max((len(row) for row in rows), default=1) - 1
-    table: Any = numbers(np.zeros((len(rows), n + 1), dtype=int), T) + 0
-    for r, row in enumerate(rows):
-        for k, weight in enumerate(row):
-            table[r, k] = numbers(weight, T)
-    first = np.zeros((n, 1), dtype=int)
-    first[:1] = 1
-    return Lti(np.eye(n, k=-1, dtype=int), first, table[:, 1:], table[:, :1], T)
 
 
 def _of_weights(entries: Sequence[tuple[int, int, _Weights]], outputs: int, inputs: int, T: Number) -> Lti:
@@ -709,7 +690,7 @@ class Limited(Fact):
             block.force(e, i, (-rho, rho))
             block.steps(e, i, _less_advance(block.path[i], 1))
             for j, weight in enumerate(c, start=1):
-                block.steps(e, i, tuple(range(j, 0, -1)), -weight)
+                block.steps(e, i, tuple(-weight * k for k in range(j, 0, -1)))
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
