@@ -85,25 +85,25 @@ def judged(seed: int) -> tuple[Case, Estimate | str, float]:
     """Return the case, its estimate or the error message, and the wall time [s]."""
     c, begin = case(seed), time.perf_counter()
     try:
-        found: Estimate | str = estimated(c)
+        estimate: Estimate | str = estimated(c)
     except ValueError as error:
-        found = str(error)
-    return c, found, time.perf_counter() - begin
+        estimate = str(error)
+    return c, estimate, time.perf_counter() - begin
 
 
 def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
     excess, scaled, none, longest = [], [], 0, 0.0
-    for c, found, seconds in results:
+    for c, estimate, seconds in results:
         longest = max(longest, seconds)
         kind = "rigid" if c.rigid else "compliant"
         what = f"{c.seed:4d} {kind:9s} m {c.mass:.3f} b {c.viscous:.3f} c {c.coulomb:.4f} {1e6 * c.step:5.1f} um"
-        if isinstance(found, str):
+        if isinstance(estimate, str):
             none += 1
-            print(f"{what} noise {c.noise}: none: {found}", flush=True)
+            print(f"{what} noise {c.noise}: none: {estimate}", flush=True)
             continue
-        excess.append(100 * (found.delta / c.viscous - 1))
-        scaled.append((found.viscous - c.viscous) / found.friction.errors["viscous"])
-        off = 100 * (found.viscous / c.viscous - 1)
+        excess.append(100 * (estimate.delta / c.viscous - 1))
+        scaled.append((estimate.viscous - c.viscous) / estimate.friction.errors["viscous"])
+        off = 100 * (estimate.viscous / c.viscous - 1)
         print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
     over = sum(e > 0 for e in excess)
     print(f"{len(excess)} bounds, {over} above the truth, the worst by {max(excess):+.3f} %; no bound in {none} cases")

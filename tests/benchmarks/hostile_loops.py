@@ -65,16 +65,16 @@ def main() -> None:
     args, missed = parser.parse_args(), 0
     for number, loop in loops(args.count, args.seed):
         started = time.process_time()
-        found = design(loop)
+        optimum = design(loop)
         seconds = time.process_time() - started
-        reached = 20 * np.log10(max(found.figures.rms_mismatch, 1e-9))
+        reached = 20 * np.log10(max(optimum.figures.rms_mismatch, 1e-9))
         least = bound(loop).rms_db if args.bound else np.nan
-        missed += not found.proved
+        missed += not optimum.proved
         delays = f"{','.join(map(str, loop.theta))}/{','.join(map(str, loop.psi))}"
-        kind, told = type(found.coupling).__name__, found.reason or "proved"
-        figures = f"{reached:8.2f} dB, bound {least:8.2f}, g {found.g:.3f}"
+        kind, told = type(optimum.coupling).__name__, optimum.reason or "proved"
+        figures = f"{reached:8.2f} dB, bound {least:8.2f}, g {optimum.g:.3f}"
         print(
-            f"{number:5d} {delays:16s} {figures} {kind:13s} {found.states:4d} states {seconds:5.1f} s  {told}",
+            f"{number:5d} {delays:16s} {figures} {kind:13s} {optimum.states:4d} states {seconds:5.1f} s  {told}",
             flush=True,
         )
     raise SystemExit(missed > 0)

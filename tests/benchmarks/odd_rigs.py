@@ -79,7 +79,7 @@ def rigs(seed: int = 7) -> list[Rig]:
         {"late": 0.3},
         {"constant": 0.02, "coulomb": 0.03},
     ]
-    found = []
+    many = []
     draw = np.random.default_rng(seed)
     for variant in range(2):
         for extra in one:
@@ -95,7 +95,7 @@ def rigs(seed: int = 7) -> list[Rig]:
                 }
             )
             name = ", ".join(f"{k} {v:g}" for k, v in extra.items()) or "ideal"
-            found.append(Rig(name, **(base | extra)))
+            many.append(Rig(name, **(base | extra)))
     for _ in range(22):
         mixed: dict[str, float] = {
             "viscous": float(np.exp(draw.uniform(np.log(0.4), np.log(2.0)))),
@@ -106,12 +106,12 @@ def rigs(seed: int = 7) -> list[Rig]:
         }
         for k in draw.choice(np.arange(1, len(one)), 3, replace=False):
             mixed |= one[k]
-        found.append(Rig("mixed: " + ", ".join(k for k in mixed if k not in BASE), **mixed))
+        many.append(Rig("mixed: " + ", ".join(k for k in mixed if k not in BASE), **mixed))
     for hand in ((0.01, 0.1, 20.0), (0.02, 0.3, 60.0), (0.05, 0.2, 30.0), (0.1, 1.0, 200.0)):
-        found.append(Rig(f"hand {hand}", hand=hand))
+        many.append(Rig(f"hand {hand}", hand=hand))
     for hand in ((0.01, 0.2, 8.0), (0.02, 0.5, 100.0)):
-        found.append(Rig(f"hand {hand} with tremor", hand=hand, tremor=0.005))
-    return found
+        many.append(Rig(f"hand {hand} with tremor", hand=hand, tremor=0.005))
+    return many
 
 
 def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBSTEPS) -> Array:
@@ -170,12 +170,12 @@ def excitation(seconds: float = 2.5) -> Array:
 def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
     """Return the estimate from a record or the error message, and the wall time [s]."""
     begin = time.perf_counter()
-    found: Estimate | str
+    estimate: Estimate | str
     try:
-        found = identify(x, signal, T, rig.step, rigid=True)
+        estimate = identify(x, signal, T, rig.step, rigid=True)
     except ValueError as error:
-        found = str(error)
-    return found, time.perf_counter() - begin
+        estimate = str(error)
+    return estimate, time.perf_counter() - begin
 
 
 def main() -> None:
@@ -188,13 +188,13 @@ def main() -> None:
     with ProcessPoolExecutor(args.workers) as pool:
         results = list(pool.map(judged, many, x.T, [signal] * len(many)))
     off, longest = [], max(seconds for _, seconds in results)
-    for i, (rig, (found, _)) in enumerate(zip(many, results, strict=True), start=1):
+    for i, (rig, (estimate, _)) in enumerate(zip(many, results, strict=True), start=1):
         before = "" if rig.name.startswith("mixed") else f" (earlier: {EARLIER.get(rig.name, 'none')})"
-        if isinstance(found, str):
-            print(f"{i:2d} {rig.name}: none: {found}{before}")
+        if isinstance(estimate, str):
+            print(f"{i:2d} {rig.name}: none: {estimate}{before}")
             continue
-        off.append(100 * (found.delta / rig.viscous - 1))
-        b = 100 * (found.viscous / rig.viscous - 1)
+        off.append(100 * (estimate.delta / rig.viscous - 1))
+        b = 100 * (estimate.viscous / rig.viscous - 1)
         print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
     above, none = sum(part > 0 for part in off), sum(part == -100 for part in off)
     print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, and {none} bounds of 0")

@@ -65,15 +65,15 @@ def main() -> None:
 def _row(path: Path, most: int, limited: int) -> None:
     loop = load(path).loop("I")
     before, beat = BEFORE.get(path.stem[:2], ("", ""))
-    found, seconds = _timed(lambda: design(loop, PATIENT))
+    optimum, seconds = _timed(lambda: design(loop, PATIENT))
     limit, took = _timed(lambda: f"{bound(loop).rms_db:7.2f}" if loop.channels <= most else "")
     held = design(loop, replace(PATIENT, limiter=True)) if loop.channels <= limited else None
     shown = f"{held.figures.rms_mismatch_db:8.2f}" if held and held.proved else ""
-    figures = found.figures
-    nearby = robustness_nearby(loop, found.coupling).required_over_available
+    figures = optimum.figures
+    nearby = robustness_nearby(loop, optimum.coupling).required_over_available
     print(
-        f"{path.stem:28} {before:>8} {beat:>13} {figures.rms_mismatch_db:7.2f} {found.g:6.3f} {limit:>7}"
-        f" {seconds:5.1f} {found.states:6} {'yes' if found.proved else 'no':>6} {found.requirement.ratio:7.4f}"
+        f"{path.stem:28} {before:>8} {beat:>13} {figures.rms_mismatch_db:7.2f} {optimum.g:6.3f} {limit:>7}"
+        f" {seconds:5.1f} {optimum.states:6} {'yes' if optimum.proved else 'no':>6} {optimum.requirement.ratio:7.4f}"
         f" {figures.high_frequency_gain:5.1f} {nearby:8.2f} {shown:>8} {took:7.1f}",
         flush=True,
     )

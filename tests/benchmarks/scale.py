@@ -109,8 +109,8 @@ def hands() -> None:
     for count in (1000, 10_000, 100_000):
         for duration in (0.0, 2.0) if count == 1000 else (0.0,):
             question = Validation(load(), PUBLISHED["I"], 0, count, MIXED, "both", duration)
-            found, used = cpu(lambda question=question: validate(question))
-            print(f"| {count} hands, {duration:g} s | {used:.2f} | {int(found.disagreements.sum())} disagreements |")
+            findings, used = cpu(lambda question=question: validate(question))
+            print(f"| {count} hands, {duration:g} s | {used:.2f} | {int(findings.disagreements.sum())} disagreements |")
 
 
 def duration() -> None:

@@ -58,9 +58,9 @@ def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
     """Validate random hands by eigenvalues; return whether all are stable, and the number of unstable ones in words."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
-    found = validate(question, progress=lambda done, total: mark(done / total))
-    bad = int(unstable(found.exact).sum())
-    return bad == 0 and found.index.size == count, f"{bad} of {found.index.size} unstable"
+    findings = validate(question, progress=lambda done, total: mark(done / total))
+    bad = int(unstable(findings.exact).sum())
+    return bad == 0 and findings.index.size == count, f"{bad} of {findings.index.size} unstable"
 
 
 _Work = Callable[[_Mark], tuple[bool, str]]

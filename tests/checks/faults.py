@@ -447,8 +447,8 @@ class _FaultOutcome:
 def rehearse_faults() -> list[_FaultOutcome]:
     """Run every case with the default scenario and lively people."""
     scenario = _lively(load())
-    made = certified_couplings(scenario, "I", None, None, 1, spare=1)
-    return [_rehearse_case(case, scenario, made)[1] for case in CASES]
+    couplings = certified_couplings(scenario, "I", None, None, 1, spare=1)
+    return [_rehearse_case(case, scenario, couplings)[1] for case in CASES]
 
 
 def _lively(scenario: Scenario) -> Scenario:
@@ -469,10 +469,10 @@ def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
 
 
 def _rehearse_case(
-    case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
+    case: Fault, scenario: Scenario, couplings: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case; with `free` nobody holds the faulty device. `made` are couplings for a delay of one tick."""
-    rehearsal = _prepared(case, scenario, made, free)
+    """Run one case; with `free` nobody holds the faulty device. `couplings` are for a delay of one tick."""
+    rehearsal = _prepared(case, scenario, couplings, free)
     return rehearsal, _rehearsed(case, rehearsal)
 
 
@@ -490,7 +490,9 @@ def rehearse_late_case(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
     return _rehearsed(case, rehearsal)
 
 
-def _prepared(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False) -> Rehearsal:
+def _prepared(
+    case: Fault, scenario: Scenario, couplings: tuple[CertifiedCoupling, ...], free: bool = False
+) -> Rehearsal:
     """Return the rehearsal of a case before its first tick."""
     info = info_of(scenario)
     scenario = _without_hand(scenario, case) if free and not case.free else scenario
@@ -507,7 +509,7 @@ def _prepared(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ..
     rehearsal = Rehearsal(
         session,
         emulator,
-        _plan(case, scenario, made),
+        _plan(case, scenario, couplings),
         faults,
         clock=case.period,
         watch=MovesAxes(emulator) if case.shown else lambda session: None,
@@ -538,13 +540,13 @@ def _rehearsed(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
     return _FaultOutcome(*told, zero_ms, case.within, wrong)
 
 
-def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
+def _plan(case: Fault, scenario: Scenario, couplings: tuple[CertifiedCoupling, ...]) -> Plan:
     def plan(ages: Ages) -> tuple[CertifiedCoupling, ...]:
         if not case.designed:
-            return made[:1]
+            return couplings[:1]
         link = ages.link_delay(1e6 * scenario.T, 0.99, 100.0)
         if (link, case.coupling) == (1, None):
-            return made
+            return couplings
         return certified_couplings(scenario, "I", case.coupling, None, link, spare=0)
 
     return plan
@@ -587,11 +589,11 @@ def table() -> int:
     limited = scenario.replace(
         device=tuple(msgspec.structs.replace(d, force_limit=_DEFAULT_CAP) for d in scenario.device)
     )
-    made, capped = (certified_couplings(s, "I", None, None, 1, spare=1) for s in (scenario, limited))
+    couplings, capped = (certified_couplings(s, "I", None, None, 1, spare=1) for s in (scenario, limited))
     wrong, finished, fastest = 0, [], 0.0
     print(f"{'fault':46s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'zero ms':>8s}  verdict")
     for case in CASES:
-        held = _rehearse_case(case, scenario, made)[1]
+        held = _rehearse_case(case, scenario, couplings)[1]
         free = _rehearse_case(case, limited, capped, free=True)[1]
         bad = [*held.wrong, *[f"free handle at {free.peak_speed:.2f} m/s"] * (free.peak_speed > _MOST_SPEED)]
         wrong, fastest = wrong + bool(bad), max(fastest, free.peak_speed)

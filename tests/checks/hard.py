@@ -99,12 +99,12 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
         return {"refused": np.inf}
     exact, own = exact_growth(loop), simulated_growth(loop, integrator, substeps)
     error = position_error(run(loop, make_engine(loop, "mujoco", integrator, substeps)), run(loop, "exact"), loop)
-    found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
+    errors = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
     if abs(own - exact) > GROWTH:
-        found["growth"] = own - exact
+        errors["growth"] = own - exact
     if (apart := error.position_relative_rms) is not None and apart > POSITION:
-        found["position"] = apart
-    return found
+        errors["position"] = apart
+    return errors
 
 
 def hard_loops(seed: int) -> Iterator[_Row]:

@@ -177,8 +177,10 @@ def slow(seed: int, count: int = 2000) -> Iterator[_Slow]:
         network = Network(("a", "b", "c"), springs, {"m": float(np.exp(rng.uniform(-3.0, 0.5)))})
         theta = tuple(rng.integers(0, 5, 3).tolist())
         scenario = load("three-rigid").replace(environment=network, theta=theta)
-        found = validate(Validation(scenario, NoCoupling(), number, 50, 1, "exact", 2.0))
-        decided = found.trace_decides
-        contradicted = int((decided & ((found.trace > 0) != (found.exact > 0))).sum())
-        worst = float(np.max(np.abs(found.trace - found.exact)[decided] / found.trace_error[decided], initial=0.0))
+        findings = validate(Validation(scenario, NoCoupling(), number, 50, 1, "exact", 2.0))
+        decided = findings.trace_decides
+        contradicted = int((decided & ((findings.trace > 0) != (findings.exact > 0))).sum())
+        worst = float(
+            np.max(np.abs(findings.trace - findings.exact)[decided] / findings.trace_error[decided], initial=0.0)
+        )
         yield _Slow(number, int(decided.sum()), contradicted, worst, not contradicted and worst < 1)

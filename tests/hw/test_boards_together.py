@@ -39,16 +39,16 @@ def alone(scenario):
 
 
 @pytest.fixture(scope="module")
-def made(scenario):
+def couplings(scenario):
     return (certified_coupling(scenario, "I", None, None, 1, behind=BEHIND),)
 
 
-def rehearsal_of(scenario, alone, made, clock=1.0, faults=((), ()), begin_us=300.0, infos=(None, None), **options):
+def rehearsal_of(scenario, alone, couplings, clock=1.0, faults=((), ()), begin_us=300.0, infos=(None, None), **options):
     parsed = [tuple(map(FaultInjection.parse, texts)) for texts in faults]
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=450, behind=BEHIND))
     first, second = (Emulator(*each) for each in zip(alone, parsed, infos, strict=True))
     further = [(second, clock, parsed[1], begin_us)]
-    return Rehearsal(session, first, lambda ages: made, parsed[0], further=further, **options)
+    return Rehearsal(session, first, lambda ages: couplings, parsed[0], further=further, **options)
 
 
 def watched(emulator):
@@ -66,26 +66,28 @@ def watched(emulator):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deaf", [pytest.param(0, marks=pytest.mark.validate), 1])
-def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, made, deaf):
+def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, couplings, deaf):
     """A deaf board ignores messages and keeps its force; the other one rests, which must not hide this force."""
     faults = [(), ()]
     faults[deaf] = ("stuck@0.1",)
     stop = (0.4, lambda session, now: session.stop("asked to", now))
-    rehearsal = rehearsal_of(scenario, alone, made, faults=faults, actions=[stop])
+    rehearsal = rehearsal_of(scenario, alone, couplings, faults=faults, actions=[stop])
     assert rehearsal.run_until_armed(1.2).stage == Stage.STOPPED
 
 
 @pytest.mark.slow
-def test_two_clocks_keep_the_energy_account(scenario, alone, made, tmp_path):
+def test_two_clocks_keep_the_energy_account(scenario, alone, couplings, tmp_path):
     """Across a slip of the clocks forces stay 1 and 2 ticks old, and the host's energies equal those at the devices."""
-    rehearsal = rehearsal_of(scenario, alone, made, 1.0001, begin_us=SLIP_SOON)
+    rehearsal = rehearsal_of(scenario, alone, couplings, 1.0001, begin_us=SLIP_SOON)
     session, rows = rehearsal.session, []
     session.record = lambda row: (rows.append(row), recorder(row))
     recorder = Recorder(2)
     ticks = [watched(rehearsal.emulator), watched(rehearsal.further[0][0])]
     rehearsal.run_until_armed(1.2)
     assert session.stage == Stage.ARMED
-    assert (made[0].scenario.theta, made[0].link, made[0].scenario.T_max) == ((1, 2), 1, 1.2e-3 * (1 + CLOCK_TOLERANCE))
+    (coupling,) = couplings
+    assert (coupling.scenario.theta, coupling.link) == ((1, 2), 1)
+    assert coupling.scenario.T_max == 1.2e-3 * (1 + CLOCK_TOLERANCE)
     assert session.counters.late == session.counters.gaps == 0
     assert session.missed_while_driving <= 1  # only the first tick after CONFIG may be missed
     steps = [row.tick for row in rows]
@@ -110,9 +112,9 @@ ENDING = ["unplug", "up:drop=1", "down:drop=1", "stall=0.03", "trip", "estop", "
 
 
 @pytest.fixture(scope="module")
-def armed(scenario, alone, made):
+def armed(scenario, alone, couplings):
     """Return a rehearsal 0.59 s after arming."""
-    rehearsal = rehearsal_of(scenario, alone, made)
+    rehearsal = rehearsal_of(scenario, alone, couplings)
     rehearsal.run_until_armed(0.59)
     return rehearsal
 
@@ -140,8 +142,8 @@ def test_a_fault_of_one_board_stops_both(armed, board, fault):
         (1.01, 300.0, "board 2: its clock is 0.99 % slower"),
     ],
 )
-def test_clocks_that_are_not_covered_prevent_forces(scenario, alone, made, clock, begin_us, cause):
-    rehearsal = rehearsal_of(scenario, alone, made, clock, begin_us=begin_us)
+def test_clocks_that_are_not_covered_prevent_forces(scenario, alone, couplings, clock, begin_us, cause):
+    rehearsal = rehearsal_of(scenario, alone, couplings, clock, begin_us=begin_us)
     rehearsal.run_until_armed(0.1)
     assert rehearsal.session.stage == Stage.STOPPED
     assert not any(moment.applied.any() for moment in rehearsal.moments)
@@ -149,28 +151,28 @@ def test_clocks_that_are_not_covered_prevent_forces(scenario, alone, made, clock
 
 
 @pytest.mark.slow
-def test_a_faster_clock_stops_forces(scenario, alone, made, monkeypatch):
+def test_a_faster_clock_stops_forces(scenario, alone, couplings, monkeypatch):
     """Without the comparison of clocks, the session stops before an answer is late."""
     monkeypatch.setattr(boards, "_COMPARED", 10**6)
-    rehearsal = rehearsal_of(scenario, alone, made, 0.998, begin_us=300.0)
+    rehearsal = rehearsal_of(scenario, alone, couplings, 0.998, begin_us=300.0)
     rehearsal.run_until_armed(1.5)
     assert rehearsal.session.cause.startswith("board 2: its clock is faster than that of the board that leads")
     assert rehearsal.session.counters.late == 0
     assert not any(emulator.applied.any() for emulator in (rehearsal.emulator, rehearsal.further[0][0]))
 
 
-def test_each_link_is_timed_by_itself(scenario, alone, made):
+def test_each_link_is_timed_by_itself(scenario, alone, couplings):
     """Waiting for the other board's sample does not add to the age of an answer."""
-    rehearsal = rehearsal_of(scenario, alone, made, faults=((), ("up:delay=0.0003",)))
+    rehearsal = rehearsal_of(scenario, alone, couplings, faults=((), ("up:delay=0.0003",)))
     rehearsal.run_until_armed(0.0)
     first, second = rehearsal._driver.device.ages
     assert (set(first), set(second)) <= ({129, 130, 131}, {429, 430, 431})
     assert rehearsal.session.measurement.result.median in (429, 430, 431)
 
 
-def test_boards_that_differ_are_refused(scenario, alone, made):
+def test_boards_that_differ_are_refused(scenario, alone, couplings):
     info = info_of(alone[1])._replace(period_ns=1_000_000)
-    rehearsal = rehearsal_of(scenario, alone, made, infos=(None, info))
+    rehearsal = rehearsal_of(scenario, alone, couplings, infos=(None, info))
     rehearsal.run(0.1)
     assert rehearsal.session.cause.startswith("board 2 has version 2, 1000000 ns, axes: 1; expected version 2, 1200000")
 
@@ -216,7 +218,7 @@ class _Terminals:
 
 
 @pytest.mark.slow
-def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypatch, capsys, tmp_path):
+def test_the_command_runs_over_two_serial_ports(scenario, alone, couplings, monkeypatch, capsys, tmp_path):
     """In virtual time, the command runs over pyserial, two pseudo-terminals and clocks that differ by 100 ppm."""
     pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
     rehearsal = rehearsal_of(scenario, [nobody(one) for one in alone], (), 1.0001, begin_us=SLIP_SOON)
@@ -224,7 +226,7 @@ def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypat
 
     def certified(scenario, *asked, behind, **more):
         assert (asked[3], behind) == (1, BEHIND)
-        return made
+        return couplings
 
     monkeypatch.setattr(bridge, "certified_couplings", certified)
     options = ["--arm", "--no-dead-man", "--no-axis-check", "--no-preflight", "--no-plot", "--case=I", "--measure=450"]

@@ -147,17 +147,17 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
     session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
-        made = []
+        couplings = []
 
         def plan(ages):
             judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
-            made.extend(certified_couplings(judged, "I", None, None, link, spare=0, own=own))
-            return made
+            couplings.extend(certified_couplings(judged, "I", None, None, link, spare=0, own=own))
+            return couplings
 
         live = Live(session, device, plan, Operator(True, seconds), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
-    return session, recorder, made
+    return session, recorder, couplings
 
 
 @pytest.mark.slow
@@ -165,14 +165,14 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     """The session has handshake, delay, certificate, forces, ramp and replay, as over the serial link."""
     sdk = StandIn(scenario)
     sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # no push during arming
-    session, recorder, (made,) = held_session(scenario, sdk, own=SOFT)
+    session, recorder, (coupling,) = held_session(scenario, sdk, own=SOFT)
     assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
     assert session.info.firmware == "omega.3"
     assert session.info.serial == 4711
     # forces acted, over 98 % of them within the certified latency
-    (t1, t2), _ = made.scenario.latency
+    (t1, t2), _ = coupling.scenario.latency
     assert 0 < t1 < 93e-6 < t2 < 300e-6  # 40 us to read, 50 to write, 3 to look at the clock
-    assert T <= (made.scenario.T_max or T) < 1.2 * T
+    assert T <= (coupling.scenario.T_max or T) < 1.2 * T
     link = recorder.link()
     assert np.abs(link["applied"]).max() > 1000
     age = 1e6 * T - link["margin_us"][link["received"]]
@@ -193,12 +193,12 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
 @pytest.mark.slow
 def test_certificates_of_host_clocks_name_period_and_latency(scenario):
     """Certificates name T_max and a latency below one sample; no whole tick is charged for the link."""
-    _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1, own=SOFT)
-    assert made.assessment.loop.theta == scenario.theta  # no tick is added for the link
-    assert made.link == 0
-    assert made.assessment.decisive.certified
-    (said,) = [remark for remark in made.remarks() if "act as they come" in remark]
-    T_max, (t1, t2) = made.scenario.T_max or made.scenario.T, made.scenario.latency[0]
+    _, _, (coupling,) = held_session(scenario, StandIn(scenario), seconds=0.1, own=SOFT)
+    assert coupling.assessment.loop.theta == scenario.theta  # no tick is added for the link
+    assert coupling.link == 0
+    assert coupling.assessment.decisive.certified
+    (said,) = [remark for remark in coupling.remarks() if "act as they come" in remark]
+    T_max, (t1, t2) = coupling.scenario.T_max or coupling.scenario.T, coupling.scenario.latency[0]
     kept = (
         f"periods up to {1e6 * T_max:.0f} us and forces that act {1e6 * t1:.0f} to {1e6 * t2:.0f} us after their sample"
     )

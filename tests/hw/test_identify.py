@@ -105,10 +105,10 @@ def test_dry_friction_is_told_from_viscous():
     T = 1.2e-3
     force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.5).signal[:, 0]
     x = np.round(played(force, T, 0.25, 1.37, 0.1) / STEP) * STEP
-    found = identify(x, force, T, STEP, rigid=True)
-    assert found.friction.coulomb == pytest.approx(0.1, rel=0.01)
-    assert found.viscous == pytest.approx(1.37, rel=0.005)
-    assert 0.98 * 1.37 < found.friction.delta < 1.37
+    estimate = identify(x, force, T, STEP, rigid=True)
+    assert estimate.friction.coulomb == pytest.approx(0.1, rel=0.01)
+    assert estimate.viscous == pytest.approx(1.37, rel=0.005)
+    assert 0.98 * 1.37 < estimate.friction.delta < 1.37
 
 
 @pytest.mark.slow
@@ -120,11 +120,11 @@ def test_a_knob_is_identified_in_radians():
     T, lever, count = 1.2e-3, 0.02, 1e-4
     force = chirp(1, T, 1, 0.2 * lever, (3.0, 60.0), 1.5).signal[:, 0]
     at_hand = played(force / lever, T, 1e-5 / lever**2, 2e-4 / lever**2, 1e-4 / lever, substeps=16)
-    found = identify(np.round(at_hand / lever / count) * count, force, T, count, True, lever)
-    assert found.friction.mass == pytest.approx(1e-5, rel=5e-3)
-    assert found.viscous == pytest.approx(2e-4, rel=0.01)
-    assert found.friction.coulomb == pytest.approx(1e-4, rel=0.02)
-    assert 0.95 * 2e-4 < found.friction.delta < 2e-4
+    estimate = identify(np.round(at_hand / lever / count) * count, force, T, count, True, lever)
+    assert estimate.friction.mass == pytest.approx(1e-5, rel=5e-3)
+    assert estimate.viscous == pytest.approx(2e-4, rel=0.01)
+    assert estimate.friction.coulomb == pytest.approx(1e-4, rel=0.02)
+    assert 0.95 * 2e-4 < estimate.friction.delta < 2e-4
 
 
 #: names of benchmark rigs (tests/benchmarks/odd_rigs.py) with viscous friction of 1 N s/m
@@ -244,11 +244,11 @@ def judged(records):
 @pytest.mark.parametrize("name", _marked(NOT_VISCOUS))
 def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
     """Neither truth nor bound includes dry friction, even if it depends on speed."""
-    found, least = judged[name], NOT_VISCOUS[name][1]
-    if isinstance(found, str):
-        assert re.search("energy of a stroke does not grow|damping falls with frequency", found)
+    estimate, least = judged[name], NOT_VISCOUS[name][1]
+    if isinstance(estimate, str):
+        assert re.search("energy of a stroke does not grow|damping falls with frequency", estimate)
     else:
-        assert found.delta <= least
+        assert estimate.delta <= least
 
 
 @pytest.mark.slow
@@ -262,9 +262,9 @@ def test_thinning_and_memory_are_refused(judged, name):
 def test_a_lag_hides_no_memory(odd, records):
     """A lag imitates a memory, so that fits which begin without a memory give a bound above the lasting 1 N s/m."""
     (rig, x), signal, T = records[0]["behind a lag"], records[1], records[2]["T"]
-    found = viscosity(x, signal, T, rig.step, odd[rig.name])
-    assert 0.8 < found.lasting <= 1.0
-    assert "damping falls with frequency" in doubt(found, odd[rig.name])
+    estimate = viscosity(x, signal, T, rig.step, odd[rig.name])
+    assert 0.8 < estimate.lasting <= 1.0
+    assert "damping falls with frequency" in doubt(estimate, odd[rig.name])
 
 
 @pytest.mark.slow
@@ -326,10 +326,10 @@ def test_undetectable_hands_add_no_damping(odd):
     """8 % more damping may be a device's scatter. The least bound counts, so one record without the hand is enough."""
     assert odd["faint"].delta > 1.05
     for order in (("faint", "ideal"), ("ideal", "faint")):
-        (found,), words = settled([sitting(odd, name) for name in order])
+        (estimate,), words = settled([sitting(odd, name) for name in order])
         assert words == []
-        assert (found.delta, found.viscous) == (odd["ideal"].delta, odd["ideal"].viscous)
-        assert found.delta <= 1
+        assert (estimate.delta, estimate.viscous) == (odd["ideal"].delta, odd["ideal"].viscous)
+        assert estimate.delta <= 1
     with pytest.raises(ValueError, match="one sitting cannot tell a hand's damping from the device's"):
         settled([sitting(odd, "ideal")])
 
@@ -506,20 +506,20 @@ def test_bounds_hold_wherever_the_encoder_stands(coarse):
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):
         x = step * np.round(exact / step + origin)
-        found = friction(x, force, T, step)
-        assert 0.98 * 0.5 < found.delta <= 0.5
-        assert found.viscous == pytest.approx(0.5, rel=0.01)
+        estimate = friction(x, force, T, step)
+        assert 0.98 * 0.5 < estimate.delta <= 0.5
+        assert estimate.viscous == pytest.approx(0.5, rel=0.01)
 
 
 def test_a_bound_never_exceeds_the_declared_damping():
     law = Friction(0.3, 0.5, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-3, 0.0, (), {}, delta=0.495, rms=0.0)
-    found = Estimate(law, None, Viscosity(0.5, 0.0, 0.0, 0.5, 1e-3, False))
+    estimate = Estimate(law, None, Viscosity(0.5, 0.0, 0.0, 0.5, 1e-3, False))
     scenario = load("omega-pair-rigid")
     little = msgspec.structs.replace(scenario.device[0], damping=0.48, delta=None)
     scenario = scenario.replace(device=(little, little), delta=(0.48, 0.48))
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
-    assert held([found], scenario, session) == []  # 4 % more than declared is not yet a hand
-    assert [e.delta for e in capped([found], scenario, session)] == [0.48]
+    assert held([estimate], scenario, session) == []  # 4 % more than declared is not yet a hand
+    assert [e.delta for e in capped([estimate], scenario, session)] == [0.48]
 
 
 def test_ambiguous_friction_gives_no_bound():

@@ -344,13 +344,13 @@ def test_long_stalls_advise_to_close_busy_programs(monkeypatch):
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory):
     """Return report, trace and folder of two rehearsals with an energy budget, with and without a picture."""
-    found = []
+    rehearsals = []
     for name, picture in (("one", []), ("two", ["--no-plot"])):
         out = tmp_path_factory.mktemp(name)
         options = ["--rehearse", "--duration", "0.5", "--energy-budget", "0.01", "--out", str(out)]
         assert bridge.main([*options, *picture, "--json", str(out / "r.json")]) == 0
-        found.append((json.loads((out / "r.json").read_text()), (out / "trace.csv").read_text(), out))
-    return found
+        rehearsals.append((json.loads((out / "r.json").read_text()), (out / "trace.csv").read_text(), out))
+    return rehearsals
 
 
 @pytest.mark.slow

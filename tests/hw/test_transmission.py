@@ -64,12 +64,12 @@ RIGS = [(0.06, 0.19, 14500.0, 0.5, 1.37), (0.09, 0.12, 9000.0, 2.5, 0.6), (0.05,
 @pytest.mark.slow
 @pytest.mark.parametrize(("m1", "m2", "k", "b", "delta"), RIGS)
 def test_bounds_contain_the_truth(m1, m2, k, b, delta):
-    found = bounds(m1, m2, k, b, delta)
-    assert 0.97 * m1 < found.motor_mass_min <= m1
-    assert k <= found.transmission_stiffness_max < 1.03 * k
-    assert found.transmission_damping_min <= b <= found.transmission_damping_max
-    assert found.transmission_damping_max - found.transmission_damping_min < 0.3 * b
-    assert found.late < 0.02 * T
+    bound = bounds(m1, m2, k, b, delta)
+    assert 0.97 * m1 < bound.motor_mass_min <= m1
+    assert k <= bound.transmission_stiffness_max < 1.03 * k
+    assert bound.transmission_damping_min <= b <= bound.transmission_damping_max
+    assert bound.transmission_damping_max - bound.transmission_damping_min < 0.3 * b
+    assert bound.late < 0.02 * T
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -106,9 +106,9 @@ def test_a_late_current_loop_is_refused():
 def test_a_soft_clamp_hides_no_stiffness(clamp):
     """A clamp that gives way makes the transmission look softer: the record is refused, or the bound still holds."""
     with suppress(ValueError):
-        found = bounds(*RIGS[0], clamp=clamp)
-        assert found.transmission_stiffness_max >= 14500.0
-        assert found.motor_mass_min <= 0.06
+        bound = bounds(*RIGS[0], clamp=clamp)
+        assert bound.transmission_stiffness_max >= 14500.0
+        assert bound.motor_mass_min <= 0.06
 
 
 @pytest.mark.slow
@@ -131,16 +131,16 @@ def test_play_and_presliding_friction_are_refused():
 @pytest.mark.slow
 def test_written_bounds_are_rounded_outwards():
     """A written table is read as a device with bounds that are no tighter than those found."""
-    found, known = bounds(*RIGS[0]), load("omega-pair-known")
+    bound, known = bounds(*RIGS[0]), load("omega-pair-known")
     axis = SimpleNamespace(
         viscous=1.37, delta=1.36, viscosity=SimpleNamespace(speed=0.5), friction=SimpleNamespace(mass=1)
     )
-    (written,) = msgspec.toml.decode(_table(known.device[0], [axis], [found]))["device"]
+    (written,) = msgspec.toml.decode(_table(known.device[0], [axis], [bound]))["device"]
     device = known.replace(device=[written] * 2).device[0]
-    assert device.guaranteed.motor_mass_min <= found.motor_mass_min
-    assert device.guaranteed.transmission_stiffness_max >= found.transmission_stiffness_max
-    assert device.guaranteed.transmission_damping_min <= found.transmission_damping_min
-    assert device.guaranteed.transmission_damping_max >= found.transmission_damping_max
+    assert device.guaranteed.motor_mass_min <= bound.motor_mass_min
+    assert device.guaranteed.transmission_stiffness_max >= bound.transmission_stiffness_max
+    assert device.guaranteed.transmission_damping_min <= bound.transmission_damping_min
+    assert device.guaranteed.transmission_damping_max >= bound.transmission_damping_max
 
 
 @pytest.mark.validate

@@ -74,7 +74,7 @@ def furnished(model: Path, place: Path) -> Path:
 def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str]:
     """Return what is wrong with a case that has ended: its exit code, its message, or changed files."""
     err, files = (place / "err").read_text(errors="surrogateescape"), place / "files"
-    found = contents(files)
+    present = contents(files)
     expected = good | (json.loads((place / "changed").read_text()) if (place / "changed").exists() else {})
     closed, wrong = "stderr closed" in case.name or "stdall" in case.name, []
     if code not in case.codes:
@@ -86,7 +86,7 @@ def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str
         wrong.append(f"not one line: {err[:300]!r}")
     if code == BUT and code in case.codes and not (closed or re.search(case.says, err)):
         wrong.append(f"does not say {case.says!r}: {err[:300]!r}")
-    wrong += [f"{name} was changed" for name, digest in expected.items() if found.get(name) != digest]
+    wrong += [f"{name} was changed" for name, digest in expected.items() if present.get(name) != digest]
     return wrong + left(files)
 
 
@@ -175,8 +175,8 @@ def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
 
 def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield the names of the cases that contain the word, and what is wrong with the end of each case."""
-    found = [case for part in (hostile_words, hostile_files) for case in part.cases() if word in case.name]
-    groups = [found[first : first + TOGETHER] for first in range(0, len(found), TOGETHER)]
+    cases = [case for part in (hostile_words, hostile_files) for case in part.cases() if word in case.name]
+    groups = [cases[first : first + TOGETHER] for first in range(0, len(cases), TOGETHER)]
     # The cases of `streams` change the streams or the memory of their process, so each has its own process.
     for group in [*groups, *([case] for case in streams() if word in case.name)]:
         yield from answered(group, folder, model)

@@ -144,16 +144,16 @@ def install(mutant: Mutant) -> None:
     """Put the code with the mistake into the function that this process has imported."""
     tree, node, new = next(rest for other, *rest in mistakes(mutant.module) if other == mutant)
     code = compile(ast.fix_missing_locations(_Replace(node, new).visit(tree)), str(ROOT / mutant.module), "exec")
-    found: Any = importlib.import_module("haptic_loop." + mutant.module.removesuffix(".py").replace("/", "."))
+    function: Any = importlib.import_module("haptic_loop." + mutant.module.removesuffix(".py").replace("/", "."))
     for part in mutant.function.split("."):
-        found = vars(found)[part]
-    if isinstance(found, property | cached_property):
-        found = found.fget if isinstance(found, property) else found.func
-    found = getattr(found, "__func__", found)
-    while hasattr(found, "__wrapped__"):
-        found = found.__wrapped__
-    assert isinstance(found, FunctionType)
-    found.__code__ = next(part for part in _codes(code) if part.co_qualname == mutant.function)
+        function = vars(function)[part]
+    if isinstance(function, property | cached_property):
+        function = function.fget if isinstance(function, property) else function.func
+    function = getattr(function, "__func__", function)
+    while hasattr(function, "__wrapped__"):
+        function = function.__wrapped__
+    assert isinstance(function, FunctionType)
+    function.__code__ = next(part for part in _codes(code) if part.co_qualname == mutant.function)
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:

@@ -65,11 +65,11 @@ def files(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
         begins = [begun(words, out, core) for out, core in zip(outs, cores, strict=True)]
         return {name: stored(one, out) for name, one, out in zip(names, begins, outs, strict=True)}
 
-    found = made("idle")
+    stored_files = made("idle")
     with busy(8):
-        found |= made("under load")
+        stored_files |= made("under load")
     core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else None
-    return found | made("at once", "with it", "on one core", core=core)
+    return stored_files | made("at once", "with it", "on one core", core=core)
 
 
 def main() -> int:
@@ -77,10 +77,10 @@ def main() -> int:
     differ = False
     for name, words in DESIGNS.items():
         with tempfile.TemporaryDirectory() as folder:
-            found = files(words, Path(folder))
-        same = len(set(found.values())) == 1
+            stored_files = files(words, Path(folder))
+        same = len(set(stored_files.values())) == 1
         differ |= not same
-        digests = ", ".join(f"{how}: {sha256(data).hexdigest()[:12]}" for how, data in found.items())
+        digests = ", ".join(f"{how}: {sha256(data).hexdigest()[:12]}" for how, data in stored_files.items())
         print(f"{name}: {'the same bytes' if same else 'DIFFERENT BYTES'} ({digests})", flush=True)
     return int(differ)
 
