@@ -29,7 +29,7 @@ def test_a_session_arms_by_itself_once(scenario, link_couplings, start):
     assert stages(session).count(Stage.ARMING) == 1
 
 
-def test_a_key_during_a_hindrance_arms_nothing(scenario, link_couplings, monkeypatch):
+def test_a_key_that_cannot_arm_is_no_arming(scenario, link_couplings, monkeypatch):
     """A key that could not arm the session does not count as an arming: the session arms by itself later."""
     held = [False]
     monkeypatch.setattr(Session, "held", property(lambda session: held[0]))

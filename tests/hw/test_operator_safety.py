@@ -318,7 +318,7 @@ def test_report_and_incident_log_name_one_cause(tmp_path, capsys):
 
 
 def test_the_preflight_says_what_the_machine_can_do():
-    """The test uses a child process, since real-time scheduling and locked memory stay with a process."""
+    """A child process makes the checks, because a process keeps its real-time scheduling and locked memory."""
     code = "from haptic_loop.hw.transport import preflight; print(preflight(['/dev/null']))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     begun = time.monotonic()

@@ -198,7 +198,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, link_couplings, cap, sl
     assert stop - first > 2  # the person begins to move soon after full gain
 
 
-class Dared(CertifiedCoupling):
+class FalselyCertified(CertifiedCoupling):
     """A coupling that claims to be certified, so that a session can show growth without a certificate."""
 
     certified = True
@@ -215,7 +215,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)
-        made = Dared(1, scenario, "I", chosen, assessed(scenario, "I", chosen))
+        made = FalselyCertified(1, scenario, "I", chosen, assessed(scenario, "I", chosen))
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
     session = rehearsal.run_until_armed(2.2 if settles else 7.2)

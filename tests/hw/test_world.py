@@ -90,7 +90,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_steps_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
-    """Without repetitions, the steps that do not settle are those with a force at the cap."""
+    """If no step may be repeated, the steps that do not settle are those with a force at the cap."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
     _, report, shown = session(tmp_path, capsys, *words)
