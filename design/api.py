@@ -21,7 +21,6 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT
-from haptic_loop.design.files import off_table
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import (
     ANY,
@@ -124,7 +123,7 @@ def instead(
 
 
 @one_blas_thread
-def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
+def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
     Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or else
@@ -149,7 +148,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     of_kind("loop", loop, Loop, _LOOP)
     alone, (_, own) = fitting(loop, coupling), name_and_own(condition)
     own = own or (coupling.own if isinstance(coupling, Design) else None)
-    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=own))
+    requirements: dict[str, Requirement] = dict(requirements_of(loop, alone, own=own))
     over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
     for each in over if loop.ranges else ():
         requirements[each.name] = _over_ranges(loop.switching(None), alone, each, requirements[each.name])
@@ -164,7 +163,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     return requirements
 
 
-def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement[str]:
+def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement:
     """Return the largest requirement over the ranges; `here` is the requirement in the nominal environment."""
     ranges = check_ranges(loop, coupling, samples=0, condition=condition)
     assert ranges  # The caller passes only loops with ranges.
@@ -192,9 +191,9 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 class _SwitchingFiled:
     """The guarantee for varying delays, and the kind of its proof or the reason why there is no proof."""
 
-    guarantee: str | None = off_table()  # None where the loop that runs has no guarantee, as with lost packets
-    proof: str | None = off_table()
-    reason: str | None = off_table()
+    guarantee: str | None  # None where the loop that runs has no guarantee, as with lost packets
+    proof: str | None
+    reason: str | None
 
 
 @dataclass(frozen=True)

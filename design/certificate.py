@@ -45,7 +45,7 @@ from haptic_loop.design.exact import (
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
-from haptic_loop.design.result import CONDITIONS, NotProved, Requirement, refusal, switching_guarantee
+from haptic_loop.design.result import NotProved, Requirement, refusal, switching_guarantee
 
 #: Allowed error of stored figures, relative to the largest available damping or the margin. Sweeps repeat to 1e-9.
 _CLAIM_TOLERANCE = 1e-6
@@ -437,9 +437,10 @@ def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[floa
     return tuple(v for name in sizes for v in stored[name]) if sizes else None
 
 
-_OURS = ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY
-# A name without a condition, or a condition without a name in CONDITIONS, raises ValueError here.
-_NAMED: dict[str, Condition] = dict(zip(CONDITIONS, sorted(_OURS, key=lambda c: CONDITIONS.index(c.name)), strict=True))
+# The package's conditions, by their names in result.CONDITIONS and in the same order.
+_NAMED: dict[str, Condition] = {
+    each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
+}
 _PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # stored as facts of a base condition
 
 

@@ -106,11 +106,22 @@ def _places(path: Path) -> set[Any]:
 
 
 def _target(path: Path) -> Path:
-    """Return the path with all links resolved. Raises OSError for circular links."""
+    """Return the path with all links resolved. Raises OSError for circular links and null bytes."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "a file name may contain no null byte")
     place = Path(os.path.realpath(path))
     if place.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
     return place
+
+
+@contextmanager
+def _refusing(what: str, hint: str = "") -> Iterator[None]:
+    """Raise an InputError that begins with `what` in place of an OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{what}: {error.strerror or error}{hint}") from None
 
 
 def _met(places: set[Any], known: dict[Any, str]) -> str | None:
@@ -125,24 +136,17 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
-    if content is None:  # A non-blocking read returns None for a kernel file such as /proc/kmsg without data.
-        raise InputError(f"{named}: has no content that can be read, expected a file with content")
     if len(content) > most:
         raise InputError(f"{named}: is larger than {most / 1e6:g} MB, the largest allowed size")
     return content
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file without blocking, because reads of /proc/kmsg would wait forever."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 @contextmanager
 def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
     """Open a regular file that no option names as output. Raises InputError, also if a later read fails."""
     path = Path(path)
-    try:
-        if path.exists() and not path.is_file():
+    with _refusing(named, hint):
+        if _target(path).exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "not a regular file"
             raise InputError(f"{named}: is {kind}, expected a file")
         if ledger := _ledger.get():
@@ -150,18 +154,8 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
             if option := _met(places, ledger.named):
                 raise InputError(f"{named}: is also the file of {option}; give that option another file")
             ledger.read |= dict.fromkeys(places, named)
-        file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  closed below
-    except OSError as error:
-        raise InputError(f"{named}: {error.strerror or error}{hint}") from None
-    except InputError:
-        raise
-    except ValueError as error:  # The name contains a null byte.
-        raise InputError(f"{named}: {error}{hint}") from None
-    with file:
-        try:
+        with open(path, "rb") as file:
             yield file
-        except OSError as error:
-            raise InputError(f"{named}: {error.strerror or error}{hint}") from None
 
 
 def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str:
@@ -214,7 +208,7 @@ def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
 
 def check_file(option: str, path: Path, expected: str = "a file") -> Path:
     """Return `path`, the file of an option. Raises InputError if it cannot be written or has another use."""
-    try:
+    with _refusing(f"{option} {path}: cannot write to {path.parent}"):
         if path.is_dir():
             raise InputError(f"{option} {path}: is a folder, expected {expected}")
         if not path.parent.is_dir():
@@ -225,12 +219,6 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
             return path
         _try(place.parent, place.name)
-    except OSError as error:
-        raise InputError(f"{option} {path}: cannot write to {path.parent}: {error.strerror or error}") from None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{option} {path!s}: {error}") from None
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):
@@ -251,16 +239,13 @@ def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
 
 def folder(path: Path) -> Path:
     """Create a folder if it does not exist. Raises InputError if files cannot be written to it."""
-    try:
+    with _refusing(f"--out {path}"):
+        place = _target(path)
         absent = [each for each in (path, *path.parents) if not each.exists()]
         path.mkdir(parents=True, exist_ok=True)
         if ledger := _ledger.get():
             ledger.folders[:0] = absent
-        _try(path)
-    except OSError as error:
-        raise InputError(f"--out {path}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise InputError(f"--out {path}: {error}") from None
+        _try(place)
     return path
 
 
@@ -277,9 +262,7 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     For a link, the file that it points to is written. Raises InputError if the file cannot be written, or if the
     command has read it, or has already written it and an option names it.
     """
-    if "\0" in str(path):
-        raise InputError(f"cannot write {str(path)!r}: a file name may contain no null byte")
-    try:
+    with _refusing(f"cannot write {path}"):
         place = _target(path)
         if place.exists() and not place.is_file():
             with place.open("wb") as device:
@@ -297,8 +280,6 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     return path
 
 
@@ -310,11 +291,9 @@ def remove(*paths: Path) -> None:
     """
     for unlink in (False, True):
         for path in paths:
-            try:
+            with _refusing(f"cannot remove {path}"):
                 if (place := _target(path)).is_file():
                     place.unlink() if unlink else _require_unused(path)
-            except OSError as error:
-                raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
 
 
 def _require_unused(path: Path) -> None:

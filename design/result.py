@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, TypeVar, get_args, overload
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +45,6 @@ CAVEATS = (
     "more work than Coulomb friction dissipates, velocity filters or friction compensation."
 )
 
-C = TypeVar("C", bound=str)  # a ConditionName, "switching", "limiter" or the name of a user's own condition
-
-
 #: Share of the available damping that must be left over. Figures of a sweep differ by up to 1e-10 between
 #: linear-algebra kernels, and by up to 2e-8 with a solver's multiplier.
 GUARD = 1e-7
@@ -63,11 +60,11 @@ def suffices(ratio: float | Array) -> bool | NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class Requirement(Generic[C]):
+class Requirement:
     """The damping that a condition requires of the devices' m channels, and the damping that they guarantee.
 
     Attributes:
-        condition: The name of the condition.
+        condition: A ConditionName, "switching", "limiter" or the name of a user's own condition.
         required: (m,) required damping [N s/m]; inf if no damping is enough.
         available: (m,) damping that the devices guarantee [N s/m].
         frequency_hz: The frequency [Hz] at which the condition binds, or None.
@@ -81,7 +78,7 @@ class Requirement(Generic[C]):
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
     """
 
-    condition: C
+    condition: str
     required: tuple[float, ...]
     available: tuple[float, ...]
     frequency_hz: float | None
@@ -143,12 +140,12 @@ class Requirement(Generic[C]):
         return self.reason or f"needs {listed(self.required)} N s/m of damping, has {have}"
 
 
-def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
+def from_ratio(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
     """Return the requirement of `ratio` times the available damping on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def refusal(condition: C, available: tuple[float, ...], reason: str, applies: bool = True) -> Requirement[C]:
+def refusal(condition: str, available: tuple[float, ...], reason: str, applies: bool = True) -> Requirement:
     """Return an infinite requirement with its reason."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason, applies=applies)
 
