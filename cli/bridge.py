@@ -24,13 +24,12 @@ from haptic_loop.hw.control import CertifiedCoupling, certified_couplings, timed
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import session_for
+from haptic_loop.hw.session import FREE_SPEED, USUAL_CAP, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
 from haptic_loop.sim.couplings import NAMES, encoder_steps, stored_coupling
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
-_FAST = 1.0  # [m/s] If a free handle can be faster at the force cap, the bridge advises a smaller cap.
 _LONGEST = 3600.0  # [s] largest --duration (time at full gain after arming), because the trace is kept in memory
 
 
@@ -69,7 +68,9 @@ def main(argv: list[str]) -> int:
         steps = session.units.encoder_step
         programs = [_with_encoder_steps(program, steps) for program in programs]
         render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
-        _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
+        caps = session.limits.cap
+        render.console(args).print(_cap_words(scenario, caps, args.force_cap), soft_wrap=True, highlight=False)
+        _print_certificate(ages, link, programs, caps, render.console(args))
         if below:
             note = (
                 "· delta is a full matrix, but the device's INFO has one number per axis: "
@@ -163,8 +164,6 @@ def _print_certificate(
         f"the certificate is for {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
-    if fast := _fast_handle(programs[0].scenario, caps):
-        console.print(fast, highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the measured delay, and reserves for longer delays"
     console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
@@ -217,15 +216,20 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     )
 
 
-def _fast_handle(scenario: Scenario, caps: Sequence[float]) -> str | None:
-    """Name the axis whose free handle may get faster than _FAST under a constant force at its cap, or return None."""
+def _cap_words(scenario: Scenario, caps: Sequence[float], chosen: float | None) -> str:
+    """Describe the force caps (m,) [N] at the hand; if the user has `chosen` one, how fast a free handle may become."""
+    newtons = f"forces at the hand are at most {listed([cap / scenario.lever for cap in caps], 3, once=True)} newtons"
+    most = f"{FREE_SPEED:g} metre per second"
+    if chosen is None:
+        why = f"at most {USUAL_CAP:g}, and no constant force may move a free handle faster than {most}"
+        return f"{newtons} (default: {why}; --force-cap changes it)"
     speeds = [scenario.lever * cap / delta for cap, delta in zip(caps, scenario.delta, strict=True)]
     fastest = max(speeds)
-    if fastest <= _FAST:
-        return None
-    axis, enough = speeds.index(fastest), scenario.delta[speeds.index(fastest)] * _FAST / scenario.lever**2
-    if_wrong = f"if its force is wrong, a free handle of axis {axis + 1} moves at up to {fastest:.3g} m/s"
-    return f"{if_wrong}: --force-cap {math.floor(100 * enough) / 100:g} keeps it below {_FAST:g} m/s"
+    if fastest <= FREE_SPEED:
+        return f"{newtons} (--force-cap)"
+    axis, enough = speeds.index(fastest), scenario.delta[speeds.index(fastest)] * FREE_SPEED / scenario.lever**2
+    if_wrong = f"if a force is wrong, a free handle of axis {axis + 1} moves at up to {fastest:.3g} metres per second"
+    return f"{newtons}; {if_wrong}: --force-cap {math.floor(100 * enough) / 100:g} keeps it below {most}"
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:

@@ -86,8 +86,9 @@ def add_output_options(parser: options.Parser, picture: bool = False) -> None:
 def add_safety_options(parser: options.Parser) -> None:
     """Add the options that limit forces and motions, and the dead-man switch."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
-    cap = "largest force of a device (default 1.3, for first sessions); if it is rotary, at the radius of the hand"
-    add("--force-cap", type=number(0.05, 12.0), default=1.3, metavar="NEWTON", help=cap)
+    cap = "largest force of a device at the hand (default 1.3, or less so that no constant force moves a free handle "
+    cap += "faster than 1 m/s)"
+    add("--force-cap", type=number(0.05, 12.0), metavar="NEWTON", help=cap)
     speed = "fastest motion of a hand while forces act (default 0.7, at most the devices' least credible_speed)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
     heat = "force that each motor can hold for ever, or one number for all; larger forces are limited in time by I2t "

@@ -29,6 +29,8 @@ _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimi
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
 STRONGEST = 12.0  # [N] largest force of a device at the hand, whatever a scenario allows
+#: default force cap [N] at the hand; a smaller one keeps free handles below this speed [m/s], whatever is faulty
+USUAL_CAP, FREE_SPEED = 1.3, 1.0
 
 Said = tuple[wire.Force | wire.Stop, ...]  # messages to the device
 
@@ -408,15 +410,26 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
     return scenario.replace(device=tuple(devices)) if devices != [*scenario.device] else scenario
 
 
-def session_for(scenario: Scenario, settings: LinkSettings, cap: float = STRONGEST, **more: Any) -> Session:
-    """Return a session in which no device's force at the hand exceeds `cap` [N].
+def default_caps(scenario: Scenario) -> list[float]:
+    """Return the default force cap [N] of every device at the hand.
 
-    Where the axes of a device are limited one by one, each of its n axes gets `cap` / sqrt(n). `more` are other fields
-    of SafetyLimits.
+    A constant force F moves a free handle with the damping b no faster than F/b. So F is the smaller of USUAL_CAP and
+    FREE_SPEED times the least eigenvalue of the guaranteed damping [N s/m] at the hand.
+    """
+    least = [np.linalg.eigvalsh(device.matrix("delta"))[0] / scenario.lever**2 for device in scenario.device]
+    return [min(USUAL_CAP, float(damping) * FREE_SPEED) for damping in least]
+
+
+def session_for(scenario: Scenario, settings: LinkSettings, cap: float | None = STRONGEST, **more: Any) -> Session:
+    """Return a session in which no device's force at the hand exceeds `cap` [N], or its default cap for None.
+
+    Where the axes of a device are limited one by one, each of its n axes gets 1 / sqrt(n) of the cap. `more` are other
+    fields of SafetyLimits.
 
     Raises:
         InputError: A limit or T is impossible, or a rotary scenario has no radius.
     """
+    each = default_caps(scenario) if cap is None else [cap] * len(scenario.device)
     scenario = axis_by_axis(scenario)
     if scenario.unit == "rad" and scenario.radius is None:
         raise InputError("radius is missing: give the distance in metres from axis to hand, which scales the limits")
@@ -427,7 +440,8 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = STRONGE
     axes = np.repeat(counts, counts)  # (m,) number of axes of the channel's device; 1 if its vector is limited
     for first, end in vectors:
         axes[first:end] = 1
-    caps = tuple(min(cap * r / n**0.5, limit) for n, limit in zip(axes.tolist(), limits, strict=True))
+    own = np.repeat(each, counts) * r / np.sqrt(axes)  # (m,) [N or N m]
+    caps = tuple(map(min, own.tolist(), limits))
     try:
         safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
         return Session(scenario, safety, settings)

@@ -34,7 +34,7 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import IncidentLog, outcome
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import InputError, load, parse
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -80,13 +80,14 @@ def test_a_release_ends_the_last_motor_test(scenario, link_couplings):
     assert 1e-6 * (at[Stage.STOPPED] - at[Stage.ARMED]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_fast_free_handles_are_announced():
+def test_force_caps_are_explained():
     """A force F moves a free handle at F/b; a torque r F moves the rim of a wheel at r^2 F/b, with b in N m s/rad."""
     three, wheel = load("three-rigid"), load("omega-pair").replace(unit="rad", radius=0.2)
-    assert "axis 2 moves at up to 1.62 m/s: --force-cap 0.8 " in bridge._fast_handle(three, [1.3] * 3)
-    assert bridge._fast_handle(three, [0.8] * 3) is None
-    assert bridge._fast_handle(wheel, [0.2 * 1.3] * 2) is None
-    assert "--force-cap 34.2" in bridge._fast_handle(wheel, [0.2 * 35, 0.2 * 30])
+    assert "at most 1.3, 0.8, 1.3 newtons (default: " in bridge._cap_words(three, [1.3, 0.8, 1.3], None)
+    assert "axis 2 moves at up to 1.62 metres per second: --force-cap 0.8 " in bridge._cap_words(three, [1.3] * 3, 1.3)
+    assert bridge._cap_words(three, [0.8] * 3, 0.8) == "forces at the hand are at most 0.8 newtons (--force-cap)"
+    assert bridge._cap_words(wheel, [0.2 * 1.3] * 2, 1.3).endswith(" at most 1.3, 1.3 newtons (--force-cap)")
+    assert "--force-cap 34.2" in bridge._cap_words(wheel, [0.2 * 35, 0.2 * 30], 35.0)
 
 
 def test_the_devices_deadman_allows_and_ends_forces(scenario, link_couplings):
@@ -153,6 +154,40 @@ def test_sessions_have_low_default_limits(scenario):
     args = _parser().parse_args(["--rehearse", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("device", "hand", "caps"),
+    [
+        ("damping = 2.0", "", [1.3]),
+        ("damping = 0.5", "", [0.5]),
+        ("damping = 2.0, delta = 0.25", "", [0.25]),
+        ("damping = 0.01, credible_speed = 10.0, force_limit = 9.0", 'unit = "rad"\nradius = 0.15', [0.01 / 0.15]),
+        ("axes = 2, damping = [[1.0, 0.4], [0.4, 1.0]]", "", [0.6] * 2),
+        ("axes = 2, damping = [[1.0, 0.4], [0.4, 1.0]], force_limit = [9.0, 9.0]", "", [0.6 / 2**0.5] * 2),
+    ],
+)
+def test_default_caps_keep_free_handles_slow(device, hand, caps):
+    """The speed Delta^-1 f of a free handle is at most 1 m/s at the hand; the directions of f include the fastest."""
+    scenario = parse(
+        f"""
+name = "light"
+T = 1e-3
+theta = [1]
+{hand}
+device = [{{ kind = "rigid", mass = 0.1, {device} }}]
+[environment]
+contacts = ["handle"]
+springs = [{{ between = ["handle", "ground"], stiffness = 9.0, damping = 0.1 }}]
+"""
+    )
+    cap = session_for(scenario, LinkSettings(), cap=None).limits.cap
+    assert cap == pytest.approx(caps)
+    directions = [[1.0]] if len(cap) == 1 else [[1.0, -1.0], [1.0, 1.0], [1.0, 0.0]]
+    length = cap[0] if scenario.balls else np.linalg.norm(cap)
+    Delta = scenario.device[0].matrix("delta")
+    speeds = [np.linalg.norm(np.linalg.solve(Delta, d)) / np.linalg.norm(d) * length for d in directions]
+    assert scenario.lever * max(speeds) <= 1 + 1e-12
 
 
 def test_the_identified_speed_limits_sessions(scenario):
