@@ -128,7 +128,7 @@ def _side_by_side(couplings: Sequence[Alternative], path: Path, names: tuple[str
     from haptic_loop.sim.plots import Panel, plot_side_by_side
 
     panels = [
-        Panel(_panel_title(each), each.trace, each.ideal, each.until_s)
+        Panel(_panel_title(each), each.trace.signals, each.ideal, each.until_s)
         for each in couplings
         if each.trace is not None and each.ideal is not None and each.coupling != "published"
     ]

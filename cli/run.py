@@ -24,15 +24,14 @@ from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.engines import INTEGRATORS
 from haptic_loop.sim.run import ENGINES, EngineSettings
 from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_latch_at_ticks
-from haptic_loop.sim.shown import Contacts, Onset, Signals
+from haptic_loop.sim.shown import Contacts, Onset
 
 if TYPE_CHECKING:
     from haptic_loop.controller.budget import BudgetFigures
     from haptic_loop.design.assessment import Assessment
     from haptic_loop.design.coverage import Robustness
     from haptic_loop.sim.api import ScenarioRun
-    from haptic_loop.sim.report import PaperRow
-    from haptic_loop.sim.run_report import Ran, RunReport
+    from haptic_loop.sim.report import PaperRow, Ran, RunReport
     from haptic_loop.sim.stability import ExactVerdict
 
 
@@ -56,7 +55,7 @@ def main(argv: list[str]) -> int:
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     render.announce(args, verdicts.verdict(assessment))
     nearby = _nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment)
-    from haptic_loop.sim.run_report import run_report
+    from haptic_loop.sim.report import run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
@@ -189,7 +188,7 @@ def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tup
     onset = Onset(growth, report.run.steady_ticks[0][1], report.credible.until_s)
     around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
     title = _title(run.simulation.scenario.title(args.case), report)
-    return Signals.of(run.trace), title, stability.exact_frequency_hz, ideal, onset, around
+    return run.trace.signals, title, stability.exact_frequency_hz, ideal, onset, around
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:

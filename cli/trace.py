@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
         from haptic_loop.sim.plots import draw_run, save
 
         strongest = next((one.frequency_hz for one in rates if one.frequency_hz), _ZOOM_HZ)
-        save(draw_run(result, args.trace, strongest), Path(args.plot))
+        save(draw_run(result.signals, args.trace, strongest), Path(args.plot))
     traced = _Traced(args.trace, result.t.size, float(result.t[-1]), rates)
     T = traced.duration_s / max(1, traced.ticks - 1)
     lines = [f"growth, {one.words(T)}" for one in rates]

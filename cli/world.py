@@ -23,7 +23,7 @@ from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import EngineSettings
 from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.shown import Contacts, Signals
+from haptic_loop.sim.shown import Contacts
 from haptic_loop.sim.world import (
     LOSSLESS,
     RANDOM,
@@ -186,7 +186,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
     if trace.t.size > 1 and not args.no_plot:
         title, around = f"{scenario.name}: a MuJoCo world", Contacts(scenario.environment.contacts)
-        shown = Signals.of(labelled), title, 1.0, None, None, around
+        shown = labelled.signals, title, 1.0, None, None, around
         painter.ask("draw_run", *shown)
         files.append(painter.save(out / "figure.png"))
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."

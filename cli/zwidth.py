@@ -20,7 +20,6 @@ from haptic_loop.design.result import MAKING, Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import UNDECIDED, HeldDevices, Plan
-from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_no_world
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
@@ -73,6 +72,8 @@ def main(argv: list[str]) -> int:
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} cells"
+    from haptic_loop.sim.report import friction_left_out
+
     unseen = friction_left_out(sweep.devices) if report.simulation.points else ()
     table = render.facts(f"K {title}", _rows(report), left=True)
     lines = [*_marked(report), *_remarks(report), *unseen]

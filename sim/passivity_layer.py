@@ -53,14 +53,9 @@ class EnergyNet:
         # A device dissipates at least delta |dx|^2 / T in a tick, which is smallest for the longest T.
         packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T
         settings: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
+        settings["encoder_step"] = process.encoder_step
         try:
-            budget = EnergyBudget(
-                loop.Delta() if loop.levels else loop.delta,
-                longest,
-                packets,
-                encoder_step=process.encoder_step,
-                **settings,
-            )
+            budget = EnergyBudget(loop.Delta() if loop.levels else loop.delta, longest, packets, **settings)
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None
         late = ages(process.delays) if lost else None
@@ -138,32 +133,21 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
     return f"it never acts from rest: the certificate for any environment leaves {100 * EPS:g} % of the damping or more"
 
 
-class _InLoop:
-    """Base class: limits forces as the actuators do, and measures how far the devices moved in a tick."""
-
-    def __init__(self, process: Process) -> None:
-        self._within = process.applied
-        self._before: Array | None = None
-
-    def _moved(self, x: Array) -> Array:
-        dx = np.zeros_like(x) if self._before is None else x - self._before
-        self._before = x.copy()
-        return dx
-
-
-class _Budgeted(_InLoop):
-    """An energy budget, followed by devices that drop a force that is too old."""
+class _Budgeted:
+    """An energy budget for forces within the actuators' limits, and devices that drop a force that is too old."""
 
     def __init__(
         self, budget: EnergyBudget, guarantee: str | None, process: Process, late: Ticks | None, oldest: Array
     ) -> None:
-        super().__init__(process)
         self._budget, self._guarantee, self._late, self._oldest = budget, guarantee, late, oldest[:, None]
-        self._acted: Array | None = None
-        self._dropped = 0
+        self._within, self._dropped = process.applied, 0
+        self._x: Array | None = None  # positions [m] at the tick before
+        self._acted: Array | None = None  # forces [N] that acted since then
 
     def send(self, x: Array, force: Array, /) -> None:
-        force[...] = self._budget.limit(self._within(force), self._moved(x), self._acted)
+        moved = np.zeros_like(x) if self._x is None else x - self._x
+        self._x = x.copy()
+        force[...] = self._budget.limit(self._within(force), moved, self._acted)
 
     def apply(self, k: int, force: Array, /) -> None:
         if self._late is not None:
@@ -190,12 +174,11 @@ def _answer(forces: Any, channels: int) -> Array:
     return answer
 
 
-class _Shelled(_InLoop):
+class _Shelled:
     """A user's own environment behind a shell, with forces within the actuators' limits."""
 
     def __init__(self, shell: Shell, plugged: Plugged, process: Process) -> None:
-        super().__init__(process)
-        self._shell, self._plugged = shell, plugged
+        self._shell, self._plugged, self._within = shell, plugged, process.applied
 
     def send(self, x: Array, force: Array, /) -> None:
         free = self._shell.free(x)

@@ -23,7 +23,7 @@ from PIL import Image
 
 from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
-from haptic_loop.sim.shown import Contacts, Onset, Run
+from haptic_loop.sim.shown import Contacts, Onset, Signals
 
 # The second process that draws a run (cli.painter) does not need controller.lti, and starts faster without it.
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ _SAME = 1e-6  # [%] a smaller force error is rounding: the commanded force equal
 
 
 def draw_run(
-    result: Run,
+    result: Signals,
     title: str,
     frequency_hz: float,
     ideal: tuple[Array, float | None] | None = None,
@@ -240,7 +240,7 @@ def draw_run(
     return figure
 
 
-def _shown_parts(result: Run, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
+def _shown_parts(result: Signals, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
     """Return slices of ticks: the whole run, and the zoom if the loop grows or the forces stand out there.
 
     The zoom lies within the credible limits and, if the loop grows, before the first clipped tick.
@@ -265,7 +265,7 @@ def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
     return dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
 
 
-def _two_points(result: Run) -> bool:
+def _two_points(result: Signals) -> bool:
     """Return whether handles and encoders differ visibly in a picture."""
     return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
 
@@ -291,7 +291,7 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
 _SHARPER = 4.0  # a zoom's least mean square of the forces' second differences, relative to that of the run
 
 
-def _stands_out(result: Run, near: slice, ticks: int) -> bool:
+def _stands_out(result: Signals, near: slice, ticks: int) -> bool:
     """Return whether the part `near` is short, and forces turn far more sharply in it than in the first `ticks`."""
     if 10 * (near.stop - near.start) > result.t.size:
         return False
@@ -299,14 +299,14 @@ def _stands_out(result: Run, near: slice, ticks: int) -> bool:
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
 
 
-def _one_point(result: Run) -> str:
+def _one_point(result: Signals) -> str:
     """Return the label of the displacement axis if one curve shows both the handle and the encoder."""
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
 
 
-def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
+def _draw_walls(axes: Array, result: Signals, around: Contacts) -> None:
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
         axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
@@ -320,7 +320,7 @@ def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
             axis.axvspan(*span, color="#F0E442", alpha=0.35, zorder=0, linewidth=0, label=label)
 
 
-def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
+def _draw_displacements(axes: Array, result: Signals, parts: tuple[slice, ...], around: Contacts) -> None:
     """Draw handles over encoders, in millimetres; only handles if both look the same in the picture."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
@@ -339,7 +339,7 @@ def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], arou
     axes[0].set_ylabel("displacement [mm]" if two else _one_point(result))
 
 
-def _draw_forces(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
+def _draw_forces(axes: Array, result: Signals, parts: tuple[slice, ...], around: Contacts) -> None:
     """Draw the forces; calm curves are drawn last, so that agitated ones do not hide them."""
     two, alike = _two_points(result), _coinciding(result.f, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
@@ -350,7 +350,7 @@ def _draw_forces(axes: Array, result: Run, parts: tuple[slice, ...], around: Con
     axes[0].set_ylabel("force fed back [N]")
 
 
-def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:
+def _grey_out(axes: Array | list[Axes], result: Signals, until: float) -> None:
     """Grey out the run after `until` [s], where the linear model of the devices is no longer credible."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
@@ -359,7 +359,7 @@ def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:
     axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
 
-def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Contacts) -> None:
+def _draw_onset(axis: Axes, result: Signals, hertz: float, onset: Onset, around: Contacts) -> None:
     """Draw the amplitude of the oscillation at the encoders up to the first clipped tick, and its prediction."""
     assert onset.growth is not None
     t, sizes = _amplitudes(result, hertz, onset.steady)
@@ -383,7 +383,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     axis.legend(fontsize=8, loc="lower right")
 
 
-def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
+def _amplitudes(result: Signals, hertz: float, ticks: int) -> tuple[Array, Array]:
     """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, in windows of 12 periods.
 
     Both arrays are empty if `ticks` is less than two windows.
@@ -401,7 +401,7 @@ def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
     return result.t[starts] + 0.5 * width * T, 2 * np.abs(sums) / (window.sum() * factor)
 
 
-def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
+def _draw_ideal(axes: Array, result: Signals, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """Draw the ideal forces, broad and pale, and cut them at three times the largest other force."""
     forces, percent = ideal
     label = "pale: the force of the object itself for this motion"
@@ -416,7 +416,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
         axis.set_ylim(max(low, -most), min(high, most))
 
 
-def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
+def _sharpest(result: Signals, frequency_hz: float, ticks: int | None = None) -> slice:
     """Return the part of the first `ticks` in which the forces turn most sharply.
 
     The part has six periods (of at most 1 s), or 60 ticks if these are longer. Its length is doubled, up to half of the
@@ -446,7 +446,7 @@ class Panel:
     """The data of one panel."""
 
     title: str
-    trace: Run
+    trace: Signals
     ideal: Array  # (N, m) forces of the ideal environment [N]
     until: float | None = None  # [s] time at which the run stops being credible; None if it never does
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -12,33 +12,14 @@ if TYPE_CHECKING:
     from haptic_loop.controller.lti import Array
 
 
-class Run(Protocol):
-    """The part of a sim.trace.Trace that a picture shows; N samples, m channels."""
-
-    @property
-    def t(self) -> Array: ...  # (N,) [s]
-    @property
-    def x(self) -> Array: ...  # (N, m) [m]
-    @property
-    def f(self) -> Array: ...  # (N, m) [N]
-    @property
-    def x_handle(self) -> Array: ...  # (N, m) [m]
-    @property
-    def names(self) -> tuple[str, ...]: ...  # (m,) names of the channels; () if they are only numbered
-
-
 class Signals(NamedTuple):
-    """The signals of a Run alone, which are sent to another process."""
+    """The part of a trace that a picture shows: N samples of m channels."""
 
-    t: Array
-    x: Array
-    f: Array
-    x_handle: Array
-    names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, run: Run) -> Self:
-        return cls(run.t, run.x, run.f, run.x_handle, run.names)
+    t: Array  # (N,) [s]
+    x: Array  # (N, m) [m]
+    f: Array  # (N, m) [N]
+    x_handle: Array  # (N, m) [m]
+    names: tuple[str, ...]  # (m,) names of the channels; () if they are only numbered
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from haptic_loop.controller.lti import Array, ReadOnly, frozen
 from haptic_loop.controller.tick import Net, at_limit
 from haptic_loop.controller.units import in_unit, with_unit
 from haptic_loop.design.files import InputError, read_arrays, write
+from haptic_loop.sim.shown import Signals
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # array in a file -> number of dimensions
 _STATES = {"z": 2, "s": 2}
@@ -128,6 +129,11 @@ class Trace(ReadOnly):
         spectrum[frequency < 10.0] = 0.0
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
+    @property
+    def signals(self) -> Signals:
+        """The part of the trace that a picture shows."""
+        return Signals(self.t, self.x, self.f, self.x_handle, self.names)
+
     def to_frame(self) -> Any:
         """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]", "f1 [N]" or "x left.y [m]".
 
@@ -157,7 +163,7 @@ class Trace(ReadOnly):
         """
         from haptic_loop.sim.plots import draw_run, relabel, save
 
-        figure = draw_run(self, title or self._title(), self.dominant_frequency_hz() or 10.0)
+        figure = draw_run(self.signals, title or self._title(), self.dominant_frequency_hz() or 10.0)
         relabel(figure, self.meta.get("unit"))
         if path is not None:
             save(figure, Path(path))
