@@ -36,7 +36,7 @@ from haptic_loop.sim.scenario import Scenario
 ENOUGH = 1.02  # damping (or friction) over that which a guarantee requires
 _GIVEN = 0.005  # [J] energy that a budget may give
 _PUSHED = 24  # number of motions that are simulated together
-_GROWN = 1.5  # a hand's motion grows if its rms speed in the last quarter exceeds this many times that in the first
+_GROWN = 1.5  # a motion counts as growing if its rms speed in the last quarter exceeds that in the first by this factor
 _ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
 

@@ -174,7 +174,7 @@ def test_budgets_bound_loops_with_walls():
 def test_the_shell_bounds_a_users_environment():
     """A force along the motion gives at most W0 = 2 mJ through the shell, and far more with a huge W0."""
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
-    V, energies = coupling.compliance(SHORT.T), {}
+    energies = {}
 
     def thief():
         before = np.zeros(2)
@@ -191,7 +191,6 @@ def test_the_shell_bounds_a_users_environment():
         trace = run(netted(simulation, Plugged(thief(), start)), "exact")
         energies[start] = energy_given(simulation, trace)
         assert trace.net.figures().limited_ticks > 100 or start > 1
-    assert V is not None
     assert energies[0.002] <= 0.002
     assert energies[1e9] > 10 * 0.002
     with pytest.raises(ValueError, match="needs a coupling"):
