@@ -232,7 +232,9 @@ def _guarantees(report: Comparison) -> render.Table:
             "at Hz" + " " * i: lambda c, of=condition: _binds(c.conditions[of]),
         }
         if i == 0:
-            cells["at 10 %"] = lambda c: _robust(c.robustness, scale)
+            cells["at 10 %"] = lambda c: render.optional(
+                c.robustness and scale * c.robustness.required_over_available, "{:.4g}"
+            )
     cells |= {
         "sup dB": lambda c: _mismatch(c, "mismatch_db"),
         "rms dB": lambda c: _mismatch(c, "rms_mismatch_db"),
@@ -260,13 +262,6 @@ def _needs(part: ConditionCurve, scale: float) -> str:
     """Return `scale` times the worst device's required over available damping; green if certified."""
     need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
     return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
-
-
-def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return `scale` times the largest required over available damping after changes of the environment by 10 %."""
-    if part is None:
-        return "-"
-    return f"{scale * part.required_over_available:.4g}"
 
 
 def _feel(report: Comparison) -> render.Table:

@@ -17,6 +17,7 @@ from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.coverage import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
+from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
@@ -44,7 +45,9 @@ def main(argv: list[str]) -> int:
     if is_world(scenario):
         from haptic_loop.cli import world
 
-        return world.design(args, scenario, out, {} if args.limiter is not None else _options_of(args, args.coupling))
+        world.check_design(args)
+        args.condition = args.condition or ANY_ENVIRONMENT.name
+        return world.design(args, scenario, out, _design(args, scenario.loop(args.case)))
     loop = _loop(args, scenario)
     begun = _begun_bound(args, loop)
     design = _design(args, loop)

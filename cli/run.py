@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from haptic_loop.design.assessment import Assessment
     from haptic_loop.design.coverage import Robustness
     from haptic_loop.sim.api import ScenarioRun
-    from haptic_loop.sim.report import PaperRow, Ran, RunReport
+    from haptic_loop.sim.report import Ran, RunReport
     from haptic_loop.sim.stability import ExactVerdict
 
 
@@ -67,7 +67,10 @@ def main(argv: list[str]) -> int:
     if lost := verdicts.lost(assessment, report.robustness):
         render.announce(args, lost)
     if args.paper:
-        report = replace(report, paper=_paper(args, simulated, report))
+        from haptic_loop.sim.report import beside_the_paper
+
+        loop = simulated, args.case, report.stability, assessment.coupling
+        report = replace(report, paper=beside_the_paper(*loop))
     tables, left_out = _tables(scenario, report)
     render.show(args, tables, [*report.remarks, *left_out], _details(report))
     with render.progress("storing the trace and drawing the picture"):
@@ -151,12 +154,6 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
     coupling, rho = assessment.coupling, assessment.force_limits.rho
     with render.progress("simulating") as move:
         return run_scenario(scenario, coupling, rho, settings, args.seed, net, move)
-
-
-def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
-    from haptic_loop.sim.report import beside_the_paper
-
-    return beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robustness | None] | None:

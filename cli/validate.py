@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -64,7 +64,10 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)
     assessment = assessment_of(args, scenario, chosen)
     question = _question(args, scenario, chosen, assessment)
-    findings, wall = _findings(args, question)
+    begin = time.perf_counter()
+    with render.progress("validating") as move:
+        findings = validate(question, args.shards, move)
+    wall = time.perf_counter() - begin
     searched = _Searched()
     if args.adversary and not (findings.interrupted or findings.lost):
         searched = _searched(args, question, chosen, assessment)
@@ -155,14 +158,6 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
     rho, every = assessment.force_limits.rho, args.traces == "all"
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=rho, all_traces=every)
-
-
-def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
-    """Return the findings on all humans, and the wall time [s]."""
-    begin = time.perf_counter()
-    with render.progress("validating") as move:
-        findings = validate(question, args.shards, move)
-    return findings, time.perf_counter() - begin
 
 
 @dataclass(frozen=True)
@@ -297,12 +292,16 @@ class _Report:
     holds: bool | None = render.figure("holds", "{r.holds_words}", absent=_NOTHING)
     reason: str | None = off_table("if given")
     interrupted: bool
-    kept: str = off_table("left out")
-    ended: str | None = render.figure("interrupted", "{r.kept}", json="left out")
-    unfinished: str | None = render.figure("unfinished", "{}; {r.kept}")
+    ended: bool | None = render.figure("interrupted", "{r.finished}", json="left out")  # None if not interrupted
+    unfinished: str | None = render.figure("unfinished", "{}; {r.finished}")
     wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")
     simulated_s_per_s: float
     remarks: Sequence[str]
+
+    @property
+    def finished(self) -> str:
+        """The number of finished humans, for a validation that ended early."""
+        return f"{self.humans} humans were finished before"
 
     @property
     def certified_words(self) -> str:
@@ -334,17 +333,6 @@ def _varying(
     return switching, timing
 
 
-class _Tests(NamedTuple):
-    """Tests of the claims, with field names as in the report."""
-
-    own_humans: _Own
-    energy_audit: verdicts.EnergyAudit | None
-    switching: verdicts.Growing[VaryingDelays] | None
-    timing: verdicts.Growing[UnevenTicks] | None
-    adversary: verdicts.Attacked | None
-    adversary_population: verdicts.Attacked | None
-
-
 def _tested(
     args: argparse.Namespace,
     chosen: Chosen,
@@ -353,8 +341,8 @@ def _tested(
     findings: Findings,
     searched: _Searched,
     certified: bool,
-) -> _Tests:
-    """Return all tests but that of the growth with random humans at constant delays."""
+) -> dict[str, Any]:
+    """Return the tests of the claims by the names of the report's fields, except that with random humans."""
     mode = worst_mode(assemble(question.scenario, chosen.coupling))
     own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
@@ -362,7 +350,14 @@ def _tested(
     energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
     switching, timing = _varying(question, chosen, assessment, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
-    return _Tests(own, energy, switching, timing, worst, drawn)
+    return {
+        "own_humans": own,
+        "energy_audit": energy,
+        "switching": switching,
+        "timing": timing,
+        "adversary": worst,
+        "adversary_population": drawn,
+    }
 
 
 def _reported(
@@ -380,12 +375,11 @@ def _reported(
     if question.environments:  # The humans meet environments of the ranges.
         certified = guarantee is not None and guarantee.environments in (ANY, RANGES)
     tests = _tested(args, chosen, assessment, question, findings, searched, certified)
-    also = all(test.holds for test in tests if test) and not chosen.fails(assessment.requirements)
+    also = all(test.holds for test in tests.values() if test) and not chosen.fails(assessment.requirements)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
     interrupted = findings.interrupted or searched.interrupted
-    finished = f"{findings.index.size} humans were finished before"
     return _Report(
         case=args.case,
         scenario=scenario.name,
@@ -401,7 +395,7 @@ def _reported(
         disagreement_words=verdicts.disagreement_words(question, findings),
         disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
         worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,
-        **tests._asdict(),
+        **tests,
         largest_difference_per_s=verdicts.largest(np.abs(findings.mujoco - findings.exact)),
         traces=traces,
         assessment=assessment,
@@ -410,8 +404,7 @@ def _reported(
         holds=also and not disagreements and not (certified and wrong.any()) if any_done else None,
         reason=None if any_done else _NOTHING,
         interrupted=interrupted,
-        kept=finished,
-        ended=finished if interrupted else None,
+        ended=interrupted or None,
         unfinished=findings.lost or None,
         wall_s=wall,
         simulated_s_per_s=findings.simulated / wall,

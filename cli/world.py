@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli.painter import Painter
-from haptic_loop.design.api import proved, store
+from haptic_loop.design.api import store
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.files import off_table, write
-from haptic_loop.design.result import Chosen, listed
+from haptic_loop.design.result import Chosen, Design, listed
 from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import EngineSettings
@@ -264,17 +263,17 @@ def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[st
 # ---- design and design.audit
 
 
-def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Mapping[str, Any]) -> int:
-    """Design a coupling for a world and store it. Return 0 if runs with it have a guarantee, 1 if not."""
+def check_design(args: argparse.Namespace) -> None:
+    """Raise InputError for options of design that have no effect in a world."""
     _refuse(args, "there is no network whose parameters could vary", ranges=None)
     _refuse(args, "delays are constant", varying_delay=None)
     _refuse(args, _SHELL, limiter=None)
-    loop, kind = scenario.loop(args.case), args.coupling
-    condition = args.condition or ANY_ENVIRONMENT.name
-    with options.refused(args=args), render.designing(loop, kind, condition) as progress:
-        designed = proved(loop, design_by_kind(loop, kind, condition, progress, **further))
-    filed = store(loop, designed, out)
-    report = _reported(args, scenario, replace(designed, kind=kind), START_J)
+
+
+def design(args: argparse.Namespace, scenario: Scenario, out: Path, designed: Design) -> int:
+    """Store a design for a world and report it. Return 0 if runs with it have a guarantee, 1 if not."""
+    filed = store(scenario.loop(args.case), designed, out)
+    report = _reported(args, scenario, replace(designed, kind=args.coupling), START_J)
     rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
     _publish(args, report, report.guarantee, rows)
     return options.exit_code(report.guaranteed)
