@@ -21,7 +21,6 @@ from haptic_loop.cli.painter import skip_docstrings
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import Robustness
 from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite, held_torques
 from haptic_loop.sim.comparison import Alternative, ComparedCoupling, Comparison, ConditionCurve, alternatives
 from haptic_loop.sim.couplings import NAMES, choose

@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     render.announce(args, verdicts.verdict(assessment))
     nearby = _nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment)
-    from haptic_loop.sim.report import run_report
+    from haptic_loop.sim.report import beside_the_paper, run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
@@ -67,10 +67,7 @@ def main(argv: list[str]) -> int:
     if lost := verdicts.lost(assessment, report.robustness):
         render.announce(args, lost)
     if args.paper:
-        from haptic_loop.sim.report import beside_the_paper
-
-        loop = simulated, args.case, report.stability, assessment.coupling
-        report = replace(report, paper=beside_the_paper(*loop))
+        report = replace(report, paper=beside_the_paper(simulated, args.case, report.stability, assessment.coupling))
     tables, left_out = _tables(scenario, report)
     render.show(args, tables, [*report.remarks, *left_out], _details(report))
     with render.progress("storing the trace and drawing the picture"):
