@@ -2,9 +2,10 @@
 
 PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some minutes; continue with --first 120)
 
-Every case draws a device from its own seed: rigid, or compliant every fourth time; mass 0.1 to 0.5 kg, viscous friction
-0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (0 in a fifth of the cases), encoder steps 1 to 20 um with a random origin,
-in half of the cases with white noise of 0.2 or 0.4 steps. The excitation is that of hw.identify without its swing.
+Every case draws a device from its own seed; every fourth is compliant, the others are rigid. Mass is 0.1 to 0.5 kg,
+viscous friction 0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (0 in a fifth of the cases). Encoder steps are 1 to 20 um
+with a random origin; half of the cases have white noise of 0.2 or 0.4 steps. The excitation is that of hw.identify,
+without its swing.
 """
 
 from __future__ import annotations

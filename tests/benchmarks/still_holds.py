@@ -1,9 +1,9 @@
 """PYTHONPATH=. python tests/benchmarks/still_holds.py [N]: is a hand that holds still ever taken for a dead encoder?
 
 N (default 10,000) holds of 1.2 s are simulated by plain integration of a mass, a damper and a spring, without the
-emulator. Each hold has a random hand (0.05 to 2 kg and a device of 0.2 to 0.5 kg, 2 to 60 N s/m, 100 to 3000 N/m), its
-tremor (8 to 12 Hz, up to 0.2 N), the device's dry friction (up to 0.3 N), the encoder (1 to 100 um, with a random
-origin), and the force of a partner whom the hand resists: up to 6 N, at 0.3 to 8 Hz, as a sine or in steps.
+emulator. All values are random. The hand has 0.05 to 2 kg, 2 to 60 N s/m, 100 to 3000 N/m, and a tremor of up to 0.2 N
+at 8 to 12 Hz. The device has 0.2 to 0.5 kg, up to 0.3 N of dry friction, and an encoder of 1 to 100 um with a random
+origin. The hand resists the force of a partner: up to 6 N at 0.3 to 8 Hz, as a sine or in steps.
 """
 
 import sys

@@ -167,8 +167,8 @@ HANDS, TICKS = 60, 12000
 def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     """Return how many lossless hands gain 2 % of energy from the middle to the end.
 
-    Each tick tries the forces of all ages at both ends of the latency and of the periods T to T_max, and each hand gets
-    the force that gives it most energy. If a hand reaches 1e6 J, the run ends, and hands above 1 J count.
+    Each tick tries the forces of all ages at both ends of the latency and of the periods T to T_max. Each hand gets the
+    force that gives it most energy. If a hand reaches 1e6 J, the run ends, and hands above 1 J count.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)

@@ -139,7 +139,7 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
 
 
 def swing(k):
-    """Return the hand's force: from tick 700 on a sine of 3 N, with 2.2 N more in 30 of 250 ticks, to exceed 4.8 N."""
+    """Return the hand's force: from tick 700 on a sine of 3 N. In 30 of 250 ticks 2.2 N more make it exceed 4.8 N."""
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 

@@ -201,7 +201,7 @@ def test_ringing_is_that_of_the_slowest_contact():
 
 
 def test_free_drifts_have_no_ringing():
-    """A free hand and device, and a free mass behind a spring of 0 N/m: all eigenvalues are 1, or 0 for the delay."""
+    """A free hand, device and mass, and a spring of 0 N/m, have only the eigenvalues 1, and 0 for the delay."""
     free = KNOCK.replace("1.5", "0.0").replace("2.0, stiffness = 150.0", "0.0, stiffness = 0.0")
     free += 'masses = { m = 1.0 }\nsprings = [{ between = ["a", "m"], stiffness = 0.0 }]'
     assert ringing(assemble(parse(free), NoCoupling())) is None

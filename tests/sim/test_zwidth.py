@@ -124,7 +124,7 @@ def test_maps_of_the_widest_plane_match_sweeps(scenario):
     ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
 )
 def test_maps_at_walls_match_single_sweeps(theta, least):
-    """K = 2000 N/m, B = 2 N s/m at a wall of 3000 N/m, 2 N s/m needs `least`; delayed permanent contact needs less."""
+    """2000 N/m and 2 N s/m need `least` at a wall of 3000 N/m and 2 N s/m. With delay permanent contact needs less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
@@ -349,7 +349,7 @@ def test_batched_processes_equal_single_ones(walls):
 
 
 def test_coulomb_friction_stops_a_device_where_coulomb_says():
-    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo, 1.4e-6 m off when measured, may be 3e-6 m off."""
+    """m v' = -b v - F stops after m/b log(1 + b v0/F). MuJoCo may err by 3e-6 m; when measured, it erred by 1.4e-6 m."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
     model = _discretised(scene, T, "RK4", 4)

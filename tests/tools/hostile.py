@@ -4,8 +4,8 @@
     python tests/tools/hostile.py --short    run one in two or three pairs of a command (or field) and a value
     python tests/tools/hostile.py --signals  send Ctrl-C or SIGTERM at random moments of a run instead
 
-A case is answered well if the command ends in time with the expected code and, if this is 2 or 3, one line on standard
-error without control characters, if every file that was there is unchanged, and if no half-written file is left. A
+A case is answered well if the command ends in time with the expected code, leaves every earlier file unchanged, and
+leaves no half-written file. With code 2 or 3 it must print one line on standard error, without control characters. A
 traceback is never an answer.
 """
 
