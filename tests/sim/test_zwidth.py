@@ -349,7 +349,7 @@ def test_batched_processes_equal_single_ones(walls):
 
 
 def test_coulomb_friction_stops_a_device_where_coulomb_says():
-    """m v' = -b v - F stops after m/b log(1 + b v0/F). MuJoCo may err by 3e-6 m; when measured, it erred by 1.4e-6 m."""
+    """m v' = -b v - F stops after m/b log(1 + b v0/F). MuJoCo may err by 3e-6 m (1.4e-6 m when measured)."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
     model = _discretised(scene, T, "RK4", 4)
