@@ -42,10 +42,10 @@ class DesignOptions(TypedDict, total=False):
 
     order: int  # ccl: states per channel
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
-    limiter: bool  # cover limited forces, too; by default only a spring-damper by this-environment tries to
+    limiter: bool  # cover limited forces, too; the default tries this only for a spring-damper by this-environment
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
     band_hz: tuple[float, float]  # [Hz] optimal, spring-damper of least mismatch: band of the mismatch
-    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: a soft penalty instead
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None for a soft penalty
     seconds: float  # optimal: time [s] after which no larger basis is tried
 
 
@@ -61,9 +61,9 @@ def design_coupling(
     Args:
         loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions), which judges a coupling that is
-            designed by the kind's usual condition. None selects the usual condition (design.designs.usual_condition),
-            as the commands do.
+        condition: The name of a condition, or your own Condition (design.conditions). Your own Condition judges a
+            coupling that is designed by the usual condition of its kind. None selects the usual condition
+            (design.designs.usual_condition), as the commands do.
         options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
     Returns:
@@ -84,7 +84,7 @@ def design_coupling(
 
 
 def certified_for(loop: Loop, certified: bool) -> Network | None:
-    """Return the loop's environment if it is the linear network of a scene and `certified` is True, else None."""
+    """Return the loop's environment if it is certified and the linear network of a MuJoCo scene, else None."""
     network = loop.environment
     return network if certified and isinstance(network, Network) and network.linear_model_of else None
 
@@ -126,14 +126,14 @@ def instead(
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
-    Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or else
-    your own condition in the Design, is also judged. With loop.varying_delay there is a further entry "switching", for
-    delays that switch in any way within that range. Your own condition is judged with the loop's ranges and switching.
+    Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or the own
+    condition of a Design, is judged with the loop's ranges and switching. With loop.varying_delay the further entry
+    "switching" is for delays that switch in any way within loop.varying_delay.
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
     all of these environments are proved and the search finds no violation, the largest of their requirements is
-    returned. Otherwise the requirement at the search's worst environment counts, too, and the result is not proved.
+    returned. Otherwise the worst environment of the search counts, too, and the result is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -208,7 +208,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its exact certificate; unchanged with ranges or varying delays, or without a proof."""
+    """Return the design with an exact certificate; with ranges, varying delays or no proof, return it unchanged."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -287,7 +287,7 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
 
 
 def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
-    """Return the coupling as `bare` does, but raise ValueError if its number of channels is not that of the loop."""
+    """Return the coupling without its Design. Raises ValueError if its number of channels is not that of the loop."""
     alone = bare(coupling)
     Stored.of(loop, alone)
     return alone

@@ -64,7 +64,8 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, in_band, silent, transparency
 from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
-#: A user's function u -> force (m,) [N]. u (m,) [m] are the environment's displacements without this tick's force.
+#: A user's function from displacements (m,) [m] of the environment to forces (m,) [N] at a tick. The displacements are
+#: those that the tick would have without force.
 PluggedEnvironment = Callable[[Array], Array]
 
 
@@ -78,10 +79,10 @@ class RangesResult:
     Attributes:
         members: The nominal environment and the vertices.
         at_members: The requirement of each member.
-        samples: Environments drawn from inside the ranges.
+        samples: Environments that are drawn at random from inside the ranges.
         at_samples: The requirement of each sample.
         vertices: The number of vertices of the ranges; at most 128 of them are members.
-        where: The vertices that are members, in words: every vertex, or 128 of 625 vertices.
+        where: Words for the vertices that are members: "every vertex", or "128 of 625 vertices".
         searched: The search between the vertices.
         at_found: The requirement at the worst environment of the search.
         seed: The seed of the samples.
@@ -123,11 +124,14 @@ class RangesResult:
     def part(self) -> dict[str, Any]:
         """Return the record as fields for JSON."""
         member, requirement = self.worst
-        inside: dict[str, Any] = {"samples": len(self.samples), "certified": 0, "seed": self.seed}
-        inside |= {"worst_ratio": None, "worst": None}
-        if self.samples:
-            i, good = worst(self.at_samples), sum(r.certified for r in self.at_samples)
-            inside |= {"certified": good, "worst_ratio": self.at_samples[i].ratio, "worst": self.samples[i].name}
+        i = worst(self.at_samples) if self.samples else None
+        inside = {
+            "samples": len(self.samples),
+            "certified": sum(r.certified for r in self.at_samples),
+            "seed": self.seed,
+            "worst_ratio": None if i is None else self.at_samples[i].ratio,
+            "worst": None if i is None else self.samples[i].name,
+        }
         part = {
             "vertices": len(self.members) - 1,
             "all_vertices": self.vertices,
@@ -153,16 +157,16 @@ def check_ranges(
     certificate: Certificate | None = None,
     condition: Condition = THIS_ENVIRONMENT,
 ) -> RangesResult | None:
-    """Check a coupling over the ranges of its loop by a condition that covers them; return None without ranges.
+    """Check a coupling by a condition over the ranges of its loop; return None for a loop without ranges.
 
-    The search is deterministic. In addition, `samples` environments are drawn at random from inside the ranges, with
-    `seed`. The search and the proof are not repeated if the caller has them as `searched` and
-    `certificate`. One set of multipliers serves all environments, including those between the vertices.
+    The search between the vertices is deterministic. In addition, `samples` environments are drawn at random, with
+    `seed`. A caller that has the search or the proof passes it as `searched` or `certificate`, and it is not repeated.
+    One set of multipliers serves all environments, including those between the vertices.
     """
     if loop.ranges is None:
         return None
     certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
-    simple = condition.extensible and not multiplier  # `in_each` sweeps this-environment without multipliers.
+    simple = condition.extensible and not multiplier  # `in_each` covers only this-environment without multipliers.
 
     def need(there: Loop) -> Requirement:
         return required_damping(there, coupling, condition, multiplier)
@@ -197,7 +201,7 @@ def check_ranges(
 def _proved_ranges(
     loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate | None
 ) -> tuple[Certificate | None, str | None, Sequence[Any] | None]:
-    """Return (the certificate for all members or None, the reason if it is None, the multipliers or None)."""
+    """Return (certificate for all members, reason why there is none, multipliers); each may be None."""
     if certificate and certificate.guarantee == RANGES and certificate.condition == condition.name:
         values = on_file(condition_of(certificate, condition), loop, certificate.multipliers)
         return certificate, None, values[: sum(condition.multiplier_sizes(loop).values())] if values else None
@@ -210,29 +214,29 @@ def _proved_ranges(
 
 
 def violated_between(where: str, place: Member, ratio: float) -> str:
-    """Return the reason why ranges are not guaranteed although members are proved; `where` names them in words."""
+    """Return the reason why ranges are not guaranteed although all members are proved; `where` names the members."""
     needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
 
-_OWN_PROOF = "by a separate proof for this environment"  # `ForceLimits.reason` of a limiter from `_by_its_own_block`
+_OWN_PROOF = "by a separate proof for this environment"  # the `reason` of a limiter from `_by_its_own_block`
 
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """The limiter and the condition that covers it, or the clipping of forces.
+    """How forces are limited: by a limiter that a condition covers, or by clipping without a proof.
 
     Attributes:
         rho: (m,) stiffnesses of the limiter [N/m]; None if forces are clipped.
-        reason: Why a condition covers limited forces, or why no condition does.
+        reason: What covers limited forces, or why nothing covers them.
         requirement: The requirement of the condition `limiter`, if it was evaluated.
         c: The multiplier of the condition `limiter`, one row per device, no unit.
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
-        less: Whether the limiter is covered in one environment only, while the guarantee covers more.
-        bounded: Whether the limiter is covered only for devices within their guaranteed bounds.
+        less: Whether the limiter is covered in one environment only, while the guarantee covers more environments.
+        bounded: Whether the limiter is covered only for devices within the bounds of the condition known-device.
         energy_budget: The start W0 [J] of an energy account of the forces; None without one.
-        void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
+        void: Whether the loop that runs has no guarantee; a proof of the limiter then does not apply.
         proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
     """
 
@@ -254,7 +258,7 @@ class ForceLimits:
 
     @property
     def words(self) -> str:
-        """The limits and what covers them, in one line for a report."""
+        """The force limits, and whether a guarantee covers limited forces, in one line for a report."""
         amounts = [f"{f:.4g}" for f in self.force_limit]
         figures = f" to {', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N" if amounts else ""
         how = f"{'clipped' if self.rho is None else 'limited'}{figures}"
@@ -276,6 +280,7 @@ class ForceLimits:
         return self.rho is not None and self.proof == "rational"
 
     def part(self) -> dict[str, Any]:
+        """Return the record as fields for JSON."""
         shown = {"rho": self.rho, "force_limit": self.force_limit, "reason": self.reason, "words": self.words}
         return shown | {"certificate": self.requirement, "c": self.c, "energy_budget": self.energy_budget}
 
@@ -288,12 +293,12 @@ def _covered_limits(
     known: Certificate | None = None,
     c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
-    """Return the limiter that a certified condition covers, or clipping and the reason why none is covered.
+    """Return the limiter that a certified condition covers, or clipping and the reason why no limiter is covered.
 
     A condition that covers a limiter without a further proof is preferred. Otherwise this-environment or known-device
-    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop. If it does not,
-    multipliers are searched for a limiter of the same beta (LimitedForces). Without a `proof`, this-environment first
-    tries the multipliers `c`. `known` is a certificate that has been verified.
+    is extended to limited forces. If `proof` holds in this loop, its limiter is used. If `proof` does not hold,
+    multipliers are searched for a limiter of the same beta (LimitedForces). Without a `proof`, the multipliers `c` are
+    tried for this-environment before others are searched. `known` is a certificate that has been verified.
     """
     covering = [each for each in requirements.values() if each.certified and each.limiter_rho is not None]
     for each in sorted(covering, key=lambda each: each.proof != "rational"):
@@ -321,7 +326,7 @@ def _by_its_own_block(
     base: str,
     c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
-    """Return the limiter that `base`, extended to limited forces, covers, or clipping with the reason."""
+    """Return the limiter that the condition `base` covers after its extension to limited forces, or clipping."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
@@ -366,7 +371,7 @@ class EncoderSteps:
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
-    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, for the report only
     friction_needed: tuple[float, ...] | None  # (m,) [N]; None if no friction is proved to suffice
     covered: bool
     words: str
@@ -380,7 +385,7 @@ class EncoderSteps:
 
     @property
     def suffix(self) -> str:
-        """The restriction by the encoder steps for the end of a guarantee in a table or a title."""
+        """The restriction by encoder steps, in words that end a guarantee in a table or a title."""
         return ", encoder steps with this object only" if self.covered else ", for exact positions only"
 
     @classmethod
@@ -393,9 +398,9 @@ class EncoderSteps:
         friction_max: Sequence[float | None] | None = None,
         beyond: str | None = None,
     ) -> EncoderSteps | None:
-        """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
+        """Compare the declared friction (m,) [N] with the need of encoder steps (m,) [m]; return None without steps.
 
-        `beyond` is the name of the condition that certifies the loop, if no friction is proved to suffice with it.
+        `beyond` is the name of the condition that certifies the loop if this condition covers no encoder steps.
         """
         if not any(steps):
             return None
@@ -431,12 +436,12 @@ class Guarantee:
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers. For an energy account it is "no passive hand", which begins `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
-        forces: Whether limited forces are covered, or what scales the forces, in words that follow "forces".
+        forces: Whether limited forces are covered, or what scales the forces; the words follow the word "forces".
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
         energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
             releases; None for a guarantee that the loop comes to rest.
-        vertices: The proved vertices of "these ranges" in words: every vertex, or 128 of 625 vertices.
+        vertices: Words for the proved vertices of "these ranges": "every vertex", or "128 of 625 vertices".
         own: Name and file of the user's own condition that gives the guarantee, in words, or None.
         positions: The restriction by encoder steps in words that follow the environments (EncoderSteps.suffix), or "".
     """
@@ -463,7 +468,7 @@ class Guarantee:
 
     @property
     def words(self) -> str:
-        """The environments, the bound of the energy, the user's own condition, and the limits by encoder steps."""
+        """The guarantee in one line: environments, bound of the energy, own condition, restriction by encoder steps."""
         by = f", by the condition {self.own}, which is your own" if self.own else ""
         return f"{self._covered}{by}{self.positions}"
 
@@ -478,6 +483,7 @@ class Guarantee:
         return self.environments
 
     def part(self) -> dict[str, Any]:
+        """Return the record as fields for JSON."""
         delays = {"lo": self.delays.lo, "hi": self.delays.hi}
         part: dict[str, Any] = {"condition": self.condition, "proof": self.proof, "facts": self.facts}
         part |= {"hands": self.hands, "environments": self.environments, "forces": self.forces}
@@ -542,7 +548,7 @@ class Assessment:
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """The loop's properties beyond constant delays, equal periods and one linear environment, in fixed order."""
+        """The names of the loop's properties beyond constant delays, equal periods and one linear environment."""
         loop, plugged = self.loop, shelled(self.environment)
         there = {
             KNOWN_DEVICE.name: loop.known_devices,
@@ -558,6 +564,7 @@ class Assessment:
 
     @property
     def decisive(self) -> Requirement:
+        """The requirement of the condition that `holds` requires."""
         return self.requirements[self.condition]
 
     @property
@@ -582,6 +589,7 @@ class Assessment:
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
+        """Return the record as fields for JSON, the same in every command."""
         loop, gains = self.loop, self.gains
         about = {"T_s": loop.T, "T_max_s": loop.T_max, "latency_s": loop.latency}
         about |= {name: getattr(loop, name) for name in ("theta", "psi", "lam", "delta")}
@@ -679,7 +687,7 @@ def assess(
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
     over = own if own and not own.beyond(loop) else over
     if known and known.condition != over.name:
-        searched = None  # That search was for another condition.
+        searched = None  # The search was made with the condition of the certificate.
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
     if ranges and own and over is not own:
         ranges = replace(ranges, certificate=None, reason=own.beyond(loop))
@@ -857,7 +865,10 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """Return (the shell's guarantee or None, the reason); it needs psi = 0, constant delays and any-environment."""
+    """Return (the guarantee of the shell, None) or (None, the reason).
+
+    A shell needs psi = 0, constant delays and a coupling that is certified for any environment.
+    """
     loop, needs = assessment.loop, assessment.requirements[(assessment.own or ANY_ENVIRONMENT).name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
@@ -872,7 +883,10 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 
 def _account(assessment: Assessment, whatever: str) -> Guarantee:
-    """Return the guarantee of an energy account, behind a certified coupling (shell) or at the devices (budget)."""
+    """Return the guarantee of an energy account, behind a certified coupling (shell) or at the devices (budget).
+
+    `whatever` are the words for the environments that the account covers.
+    """
     loop, plugged, own = assessment.loop, shelled(assessment.environment), assessment.own
     behind = (own or ANY_ENVIRONMENT).name
     condition = behind if plugged else "energy-budget"

@@ -495,13 +495,14 @@ void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS])
 """
 
 
-#: C code of the box problem, for ticks in which a force would exceed its limit
-_LIMIT_DEFINED = """
+_SIZE_DEFINED = """
 static ${real} ${name}_size(${real} a)
 {
     return a < 0.0${f} ? -a : a;
 }
-
+"""
+#: C code of the box problem, for ticks in which a force would exceed its limit
+_LIMIT_DEFINED = """
 /* Solves f = q - M e with f within the limits; e is 0 or has the sign of the reached limit. Every turn switches the
  * first wrong limit. */
 static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
@@ -557,11 +558,6 @@ static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_C
 """
 #: C code for device forces that are limited as vectors
 _BALLS_DEFINED = """
-static ${real} ${name}_size(${real} a)
-{
-    return a < 0.0${f} ? -a : a;
-}
-
 /* Solves A x = b for the rows from begin to end; b is in column end. */
 static void ${name}_eliminate(${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1], int begin, int end, ${real} *x)
 {
@@ -786,7 +782,7 @@ def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) 
     for of, values in integers.items():
         row = ", ".join(map(str, values))
         words["tables"] += f"\n\nstatic const int {name}_{of}[{len(values)}] = {{{row}}};"
-    words["limit_defined"] = Template(defined).substitute(words)
+    words["limit_defined"] = Template(_SIZE_DEFINED + defined).substitute(words)
     words["limited"] = Template(_LIMITED).substitute(words)
 
 

@@ -15,7 +15,7 @@ from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 
-#: The one list of the package's conditions, in the order of tables and messages; design.certificate has the conditions.
+#: names of the package's conditions, in the order of tables and messages
 ConditionName = Literal["any-environment", "this-environment", "known-device", "known-device-any"]
 #: the environments that a certificate covers
 Environments = Literal["any passive environment", "these ranges", "this environment"]
@@ -72,9 +72,9 @@ class Requirement:
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
         multiplier: The multiplier with which `required` was computed, or None.
         bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None. For a
-            limiter it is the bound of the block less `Demand.spare`, unless `ratio` is smaller.
+            limiter, `Demand.spare` is first subtracted from the block, and `bound` is at most `ratio`.
         guarantee: The environments for which the condition holds, in words.
-        limiter_rho: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
+        limiter_rho: (m,) stiffnesses rho [N/m] of a limiter that the condition covers without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
     """
 
@@ -172,7 +172,7 @@ class NotProved(ValueError):
 
 
 class DesignFailed(ValueError):
-    """No design was verified. `problem` is the convex problem or None, `results` the attempts, `advice` the message."""
+    """No design was verified. `problem` is the convex problem or None, `results` are the attempts."""
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice
@@ -184,7 +184,10 @@ class Infeasible(DesignFailed):
 
 
 def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) -> str:
-    """Return values as "1.37, 0.5" with `digits` digits, None as inf; `once` prints three or more equal ones as one."""
+    """Return values as "1.37, 0.5" with `digits` digits, and None as "inf".
+
+    With `once`, three or more equal values are printed as one.
+    """
     texts = ["inf" if v is None else f"{v + 0.0:.{digits}g}" for v in values]
     return texts[0] if once and len(texts) > 2 and len(set(texts)) == 1 else ", ".join(texts)
 
