@@ -16,9 +16,9 @@ from haptic_loop.sim.scenario import InputError, require_even_ticks, require_lin
 
 _MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; 3 million take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: error of the growth rate [1/s], with or without coupling (the larger one)",
+    "position: relative rms error; growth: larger error [1/s] of the growth rates with and without coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
-    "real: simulated seconds per second; *: right, and on its engine's Pareto front of speed and both errors",
+    "real: simulated seconds per second; *: right, and no setting of its engine is better in speed and both errors",
 )
 
 
@@ -67,7 +67,10 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(judged: Sequence[bool], rows: Sequence[Row]) -> str:
-    """State whether the default settings have the right verdicts; `judged` has one entry per measured default."""
+    """State whether the default settings have the right verdicts.
+
+    `judged` has an entry for each default setting that was measured: whether its verdicts are right.
+    """
     which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
     words = f"{which} stability as the exact engine does" if judged else which
     words = words if all(judged) else "A DEFAULT JUDGES STABILITY WRONGLY"

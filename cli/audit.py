@@ -1,4 +1,4 @@
-"""python -m design.audit: assess a coupling, with its margins and the frequency at which its condition binds."""
+"""python -m design.audit: assess a coupling, and report its margins and the frequency that limits each of them."""
 
 from __future__ import annotations
 
@@ -234,7 +234,10 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """Return the range of --varying-delay, else the loop's range, if any. Raises InputError if theta is outside."""
+    """Return the range of delays of --varying-delay or of the loop; None for constant delays.
+
+    Raises InputError if theta lies outside of the range.
+    """
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:
@@ -266,7 +269,7 @@ def _tables(result: Audit) -> list[render.Table]:
 
 
 def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
-    """Return a sentence on the stiffest wall that is certified with the coupling's damper, or why none is named."""
+    """Return a sentence that names the stiffest certified wall with the coupling's damper, or says why it cannot."""
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:
@@ -324,7 +327,7 @@ def _remarks(report: _Report) -> Iterator[str]:
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
-    """Yield the changes that certify the coupling, the least required damping first, or that there are none."""
+    """Yield a line for each change that certifies the coupling, by required damping, or a line that none was found."""
     enough = [each for each in helps if each.requirement.certified]
     if not enough:
         yield "What helps: no change of delay, damper or period alone was found to suffice; a design finds other gains."

@@ -45,12 +45,12 @@ def main(argv: list[str]) -> int:
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # A world has its energy account instead, which begins with `start` [J].
+        args.energy_budget = None  # In a world the energy account, which begins with `start` [J], replaces the budget.
     behind = session_cli.boards_behind(args, scenario)
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    # No person can move the axes in a rehearsal, so they are not checked; the scenario's hands hold the handles.
+    # In a rehearsal the scenario's hands hold the handles, and no person can move the axes for a check.
     checked = not (args.rehearse or args.no_axis_check)
     settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse, check_axes=checked)
     session = session_for(scenario, settings, **limits)
@@ -142,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_condition()
     latch = (
-        "when forces act: at whole ticks (default), or on arrival with a certified latency (force-dimension: always)"
+        "when forces act: at whole ticks (default), or on arrival with a certified latency (always for force-dimension)"
     )
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     parser.add_energy_budget()

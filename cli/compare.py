@@ -1,9 +1,9 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
 Without --coupling, the table has one row for each coupling of sim.comparison that suits the loop. The row of a failed
-design says why it failed. In loops without walls and friction each coupling also runs with the scenario's hands;
-couplings.png shows the forces, but not those of the paper's gains. With --coupling, the named couplings are drawn over
-frequency.
+design gives the reason. In loops without walls and friction each coupling also runs with the scenario's hands;
+couplings.png shows the forces of all couplings but the paper's gains. With --coupling, the named couplings are drawn
+over frequency.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
 from haptic_loop.sim.stability import MARGINAL
 
-_MOST = 6  # number of curves that can be distinguished in one panel
+_MOST = 6  # largest number of curves that can be distinguished in one panel
 
 
 def main(argv: list[str]) -> int:
@@ -87,7 +87,10 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Name the guaranteed coupling of least force error; of equal errors, that with dc_ratio nearest to 1."""
+    """Return a sentence that names the guaranteed coupling of least force error, and its static stiffness.
+
+    Among couplings of equal error it names the coupling whose share of the static stiffness is nearest to 1.
+    """
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -253,7 +256,7 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    # A sweep finds a maximum at w = 0 to 1e-5 rad/sample (1.6 mHz at T = 1 ms), so finer digits mean nothing.
+    # A sweep may find a maximum at w = 0 at up to 1e-5 rad/sample (1.6 mHz at T = 1 ms): finer digits mean nothing.
     return render.optional(hz and round(hz, 3), "{:.4g}")
 
 

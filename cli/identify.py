@@ -1,8 +1,8 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
 By default two sittings (sessions) are recorded; with --port, the user moves the handles between them. Nobody may hold a
-handle; if a hand damps a handle in one sitting, the other reveals it. With --transmission two sittings with clamped
-handles follow, for bounds of motor mass and transmission (hw/transmission.py), which the known-device conditions need.
+handle: a hand that damps a handle in one sitting is revealed by the other sitting. With --transmission two sittings
+with clamped handles follow, for the bounds of motor mass and transmission that the known-device conditions need.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class _Sitting:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """The report of all sittings; `session` is the last one with free handles."""
+    """The report of all sittings; `session` is that of the last sitting with free handles."""
 
     session: SessionReport = off_table("inlined")
     axes: list[Estimate] = off_table()
@@ -168,7 +168,7 @@ def _sitting(
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
-    r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise: the options are figures at the hand
+    r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise; options give figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
     axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
@@ -191,7 +191,7 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {task}")
     emulated = nobody(scenario, 0.0 if clamped is None else _CLAMPED)
-    # `hold_session` counts time at full gain, which the gain reaches in the first 0.3 s, with zero force.
+    # `hold_session` counts time at full gain. The gain rises in the first 0.3 s, in which the excitation is zero.
     seconds = played(1).seconds - 0.2
     live = hold_session(args, session, plan, seconds, out, emulated)
     if number == 1:

@@ -284,7 +284,7 @@ def hold_session(
 
 
 def _logged(session: Session, out: Path) -> IncidentLog:
-    """Return the incident log of a session whose device is open, so that a missing port leaves no file."""
+    """Begin the incident log of a session and return it. It is called once the port is open: a missing port has no log."""
     incidents = IncidentLog(out / "incidents.jsonl")
     incidents.attach(session)
     return incidents
