@@ -284,7 +284,7 @@ def hold_session(
 
 
 def _logged(session: Session, out: Path) -> IncidentLog:
-    """Begin the incident log of a session and return it. It is called once the port is open: a missing port has no log."""
+    """Begin the incident log of a session whose port is open, and return it. A missing port leaves no log."""
     incidents = IncidentLog(out / "incidents.jsonl")
     incidents.attach(session)
     return incidents
