@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from math import prod
 from random import Random
@@ -123,7 +124,8 @@ def where_proved(network: Network, ranges: Ranges) -> str:
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
     """Return the ranges as one region for every combination of present and absent springs."""
     parts = _parts(network, ranges)
-    return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
+    choices = product(*((True, False) if part.absent else (True,) for part in parts))
+    return tuple(_region(network, parts, present) for present in choices)
 
 
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
@@ -136,22 +138,31 @@ def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Mem
 
 
 @dataclass(frozen=True)
-class _State:
-    """One state of an uncertain part, present or absent, with the ranges of this state."""
-
-    ranges: tuple[_Range, ...]  # the ranges whose width is not 0
-    value: Callable[[Sequence[float]], Spring | float]  # a number within each range -> the part
-
-
-@dataclass(frozen=True)
 class _Part:
-    """One uncertain part, a spring or a mass, with its values at the ends of its ranges and between them."""
+    """One uncertain part: a spring with ranges of stiffness and damping, or a mass with one range."""
 
     place: str  # a spring's ends, or a node
-    corners: tuple[Spring | float, ...]  # the part at every combination of ends, and absent if it may be
     own: Spring | float  # the part as it is in the environment
-    draw: Callable[[np.random.Generator], Spring | float]
-    states: tuple[_State, ...]  # present, and absent if it may be
+    ranges: tuple[_Range, ...]  # of stiffness [N/m] and damping [N s/m], or of the mass [kg]; the width may be 0
+    absent: Spring | None = None  # the spring without stiffness and damping, if the spring may be absent
+
+    def at(self, *values: float) -> Spring | float:
+        """Return the present part with one value for each range."""
+        if isinstance(self.own, Spring):
+            return Spring(self.own.between, *values, along=self.own.along)
+        return values[0]
+
+    @cached_property
+    def corners(self) -> list[Spring | float]:
+        """The part at every combination of the ends of its ranges, and the absent spring if it may be absent."""
+        corners = [self.at(*values) for values in dict.fromkeys(product(*self.ranges))]
+        return corners if self.absent is None or self.absent in corners else [*corners, self.absent]
+
+    def draw(self, rng: np.random.Generator) -> Spring | float:
+        """Draw the part; a spring that may be absent is absent with probability 1/2."""
+        present = self.at(*(rng.uniform(low, high) for low, high in self.ranges))
+        coin = rng.random() if isinstance(self.own, Spring) else 1.0
+        return self.absent if self.absent and coin < 0.5 else present
 
     def label(self, value: Spring | float) -> str:
         if not isinstance(value, Spring):
@@ -188,44 +199,21 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         raise ValueError(f"{field}: the spring there has an inertance; give ranges to springs without inertance")
     if len(springs) > 1:
         raise ValueError(f"{field}: the environment has {len(springs)} springs there, expected one")
-    nothing = Spring((a, b), 0.0, 0.0)
     if springs:
-        own, present = springs[0], springs[0]
-        _check_inside(field, uncertain, own)
+        own = springs[0]
+        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
+            if limits := getattr(uncertain, name):
+                _require_inside(f"{field}: {name}", limits, getattr(own, name), unit)
     elif uncertain.absent and uncertain.stiffness:
-        own, present = nothing, nothing
+        own = Spring((a, b), 0.0, 0.0)
     else:
         raise ValueError(f"{field}: no spring is there; for a contact that may arise give stiffness and absent = true")
-    stiffness = uncertain.stiffness or (present.stiffness, present.stiffness)
-    damping = uncertain.damping or (present.damping, present.damping)
+    stiffness = uncertain.stiffness or (own.stiffness, own.stiffness)
+    damping = uncertain.damping or (own.damping, own.damping)
     if not uncertain.absent and stiffness[0] == stiffness[1] and damping[0] == damping[1]:
         raise ValueError(f"{field}: nothing is uncertain; give stiffness or damping a range, or absent = true")
-    pairs = dict.fromkeys(product(stiffness, damping))
-    corners = [Spring(own.between, k, d, along=own.along) for k, d in pairs]
-    absent = Spring(own.between, 0.0, 0.0, along=own.along)
-    if uncertain.absent and absent not in corners:
-        corners.append(absent)
-
-    def draw(rng: np.random.Generator) -> Spring:
-        k, d, coin = rng.uniform(stiffness[0], stiffness[1]), rng.uniform(damping[0], damping[1]), rng.random()
-        return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d, along=own.along)
-
-    states = [_spring_state(own, stiffness, damping)]
-    if uncertain.absent:
-        states.append(_State((), lambda _: absent))
-    return _Part(f"{a}-{b}", tuple(corners), own, draw, tuple(states))
-
-
-def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
-    """Return the state of a present spring. A range of width 0 does not become a coordinate of the region."""
-    free = [low < high for low, high in (stiffness, damping)]
-
-    def value(point: Sequence[float]) -> Spring:
-        coordinates = iter(point)
-        k, d = (next(coordinates) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
-        return Spring(own.between, float(k), float(d), along=own.along)
-
-    return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)
+    absent = Spring(own.between, 0.0, 0.0, along=own.along) if uncertain.absent else None
+    return _Part(f"{a}-{b}", own, (stiffness, damping), absent)
 
 
 def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
@@ -236,16 +224,19 @@ def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
     _require_inside(f"ranges.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
         raise ValueError(f"ranges.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
-    state = _State((limits,), lambda point: float(point[0]))
-    return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]), (state,))
+    return _Part(node, own, (limits,))
 
 
-def _region(network: Network, parts: Sequence[_Part], states: Sequence[_State]) -> Region:
-    low, high = np.array([r for state in states for r in state.ranges], dtype=float).reshape(-1, 2).T
-    ends = np.cumsum([len(state.ranges) for state in states])[:-1]
+def _region(network: Network, parts: Sequence[_Part], present: Sequence[bool]) -> Region:
+    """Return the region in which these parts are present. A range of width 0 is no coordinate of the region."""
+    free = [r for part, here in zip(parts, present, strict=True) if here for r in part.ranges if r[0] < r[1]]
+    low, high = np.array(free, dtype=float).reshape(-1, 2).T
 
     def at(name: str, point: Array) -> Member:
-        values = [s.value(x.tolist()) for s, x in zip(states, np.split(point, ends), strict=True)]
+        coordinates, values = iter(point.tolist()), []
+        for part, here in zip(parts, present, strict=True):
+            amounts = (next(coordinates) if least < most else least for least, most in part.ranges)
+            values.append(part.at(*amounts) if here else part.absent)
         return _member(name, network, parts, values)
 
     return Region(low, high, at)
@@ -262,13 +253,6 @@ def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequenc
             springs.append(value)
     labels = "; ".join(part.label(value) for part, value in zip(parts, values, strict=True))
     return Member(f"{name} ({labels})", msgspec.structs.replace(network, springs=tuple(springs), masses=masses))
-
-
-def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:
-    for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
-        limits = getattr(uncertain, name)
-        if limits:
-            _require_inside(f"{field}: {name}", limits, getattr(own, name), unit)
 
 
 def _require_inside(field: str, limits: _Range, own: float, unit: str) -> None:
