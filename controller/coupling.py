@@ -588,22 +588,29 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An immutable record that refuses unknown fields."""
 
 
-class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
-    @property
-    def shape(self) -> None:
-        """The field that determines the number of channels, and its size; None if any number is allowed."""
-        return None
+class _Form(Strict, frozen=True, tag_field="kind"):
+    """The fields of a coupling in a file. Raises ValueError if no coupling can be built from them."""
 
-    def build(self, T: float) -> NoCoupling:
+    def __post_init__(self) -> None:
+        self.build(1.0)
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        """The field that determines the number of channels, and its size; empty if any number is allowed."""
+        return ()
+
+    def build(self, T: float) -> Coupling:
+        """Return the coupling for the period T [s]."""
         return NoCoupling()
 
 
-class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
+class _NoForm(_Form, frozen=True, tag="none"):
+    """A file with NoCoupling has no further fields."""
+
+
+class _SpringDamperForm(_Form, frozen=True, tag="spring-damper"):
     K: tuple[float, ...]  # (m,) [N/m]
     B: tuple[float, ...]  # (m,) [N s/m]
-
-    def __post_init__(self) -> None:
-        SpringDamper(self.K, self.B)
 
     @property
     def shape(self) -> tuple[str, int]:
@@ -613,12 +620,9 @@ class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-dampe
         return SpringDamper(self.K, self.B)
 
 
-class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix-spring-damper"):
+class _MatrixSpringDamperForm(_Form, frozen=True, tag="matrix-spring-damper"):
     K: _Rows  # (m, m) [N/m]
     B: _Rows  # (m, m) [N s/m]
-
-    def __post_init__(self) -> None:
-        self.build(1.0)
 
     @property
     def shape(self) -> tuple[str, int, int]:
@@ -628,13 +632,10 @@ class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix
         return _MatrixSpringDamper(*(_table(name, getattr(self, name), *(len(self.K),) * 2) for name in "KB"))
 
 
-class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
+class _MovingAverageForm(_Form, frozen=True, tag="moving-average"):
     weight: tuple[float, ...]  # (m,) [m/N]
     terms: tuple[int, ...]  # (m,)
     constant: tuple[float, ...]  # (m,) [m/N]
-
-    def __post_init__(self) -> None:
-        self.build(1.0)
 
     @property
     def shape(self) -> tuple[str, int]:
@@ -644,14 +645,11 @@ class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-aver
         return MovingAverage(self.weight, self.terms, self.constant)
 
 
-class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
+class _ComplianceForm(_Form, frozen=True, tag="compliance"):
     A: _Rows
     B: _Rows
     C: _Rows
     D: _Rows
-
-    def __post_init__(self) -> None:
-        self.build(1.0)
 
     @property
     def shape(self) -> tuple[str, int, int]:
@@ -664,7 +662,7 @@ class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
         return Compliance(Lti(*tables, D, T))
 
 
-class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
+class _InternalModelForm(_Form, frozen=True, tag="internal-model"):
     poles: tuple[float, ...]  # (n,)
     Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
 
@@ -673,7 +671,7 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
             raise ValueError("Q has coefficients that are not square matrices of one size")
         for rows in self.Q:
             _require_sensible("Q", rows)
-        self.build(1.0)
+        super().__post_init__()
 
     @property
     def shape(self) -> tuple[str, int, int]:
@@ -683,7 +681,7 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
         return _InternalModel(self.poles, self.Q)
 
 
-class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
+class _ForceFilterForm(_Form, frozen=True, tag="force-filter"):
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)
     R: tuple[_Rows, ...]  # (1 + n + 2 p, m, m or m + 1)
@@ -691,7 +689,7 @@ class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"
     def __post_init__(self) -> None:
         if any([len(row) for row in rows] != [len(self.R[0][0])] * len(self.R[0]) for rows in self.R):
             raise ValueError("R has coefficients that are not matrices of one size")
-        self.build(1.0)
+        super().__post_init__()
 
     @property
     def shape(self) -> tuple[str, int, int]:
@@ -714,10 +712,10 @@ Form = (
 
 def require_channels(form: Form, m: int) -> None:
     """Raise ValueError if the form does not have m channels."""
-    shape = form.shape
-    if shape is not None and any(size != m for size in shape[1:]):
-        size = f"is {shape[1]} x {shape[2]}" if len(shape) > 2 else f"has {shape[1]} entries"
-        raise ValueError(f"{shape[0]} {size}, the environment has {m} contacts")
+    name, *sizes = form.shape or ("",)
+    if any(size != m for size in sizes):
+        size = f"is {sizes[0]} x {sizes[1]}" if len(sizes) > 1 else f"has {sizes[0]} entries"
+        raise ValueError(f"{name} {size}, the environment has {m} contacts")
 
 
 def _require_sensible(name: str, rows: _Rows | Array) -> None:
