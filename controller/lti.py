@@ -134,9 +134,9 @@ class Lti(ReadOnly):
     @classmethod
     def diag(cls, *blocks: Lti) -> Self:
         """Return the block-diagonal system: each block keeps its own inputs and outputs."""
-        A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
+        A, B, C, D = (block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
         joined = cls(A, B, C, D, _common_period(*blocks))
-        return _with_parts(joined, lambda: tuple(map(_block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
+        return _with_parts(joined, lambda: tuple(map(block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
 
     @classmethod
     def stacked(cls, blocks: Sequence[Lti]) -> Self:
@@ -254,7 +254,7 @@ class Lti(ReadOnly):
         """
         core, lines = self._lines
         A, B = self.A[core[:, None], core], self.B[core]
-        if _is_lower(A):
+        if not np.triu(A, 1).any():
             return None
         C = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
         if (modes := _long_modes(A)) is None:
@@ -333,7 +333,7 @@ class Lti(ReadOnly):
 
     def dc(self) -> Array:
         """Return G(1), shape (..., p, m). Raises SingularLoop if A has the eigenvalue one."""
-        return self._rest[0] if self.is_exact else self.C @ solve(_identity(self) - self.A, self.B) + self.D
+        return self._rest[0] if self.is_exact else self.C @ solve(eye(self.order, self.T) - self.A, self.B) + self.D
 
     @cached_property
     def _rest(self) -> tuple[Array, Array]:
@@ -347,7 +347,8 @@ class Lti(ReadOnly):
                 return from_parts()
             except SingularLoop:  # a part is singular at z = 1; the composed block may be regular
                 pass
-        R = np.swapaxes(solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
+        transposed = np.swapaxes(eye(self.order, self.T) - self.A, -1, -2)
+        R = np.swapaxes(solve(transposed, np.swapaxes(self.C, -1, -2)), -1, -2)
         return self.D + times(R, self.B), R
 
     def __getstate__(self) -> dict[str, Any]:
@@ -405,7 +406,7 @@ class Lti(ReadOnly):
         if not isinstance(other, Lti):
             return Lti(self.A, self.B, self.C, self.D + other, self.T)
         T = _common_period(self, other)
-        A = _block_diagonal([self.A, other.A])
+        A = block_diagonal([self.A, other.A])
         return Lti(A, _block([[self.B], [other.B]]), _block([[self.C, other.C]]), self.D + other.D, T)
 
     __radd__ = __add__
@@ -438,7 +439,7 @@ class Lti(ReadOnly):
         y_x = _block([[times(S, self.C), -times(y_u, other.C)]])
         u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - times(other.D, y_x)
         u_u = eye(self.inputs, T) - times(other.D, y_u)
-        A = _block_diagonal([self.A, other.A]) + _block([[times(self.B, u_x)], [times(other.B, y_x)]])
+        A = block_diagonal([self.A, other.A]) + _block([[times(self.B, u_x)], [times(other.B, y_x)]])
         loop = Lti(A, _block([[times(self.B, u_u)], [times(other.B, y_u)]]), y_x, y_u, T)
 
         def rest() -> tuple[Array, Array]:
@@ -510,10 +511,6 @@ def _schur_form(A: Array) -> tuple[Complex, Complex]:
     if fault:
         raise np.linalg.LinAlgError("the Schur form did not converge")
     return S, U
-
-
-def _is_lower(A: Array) -> bool:
-    return not np.triu(A, 1).any()
 
 
 def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) -> Complex:
@@ -638,8 +635,8 @@ def vstack(*blocks: Any) -> Any:
     C, D = [[b.C] for b in blocks], _block([[b.D] for b in blocks])
     if all(b.A is first.A and b.B is first.B for b in blocks):
         return Lti(first.A, first.B, _block(C), D, T)
-    A, B = _block_diagonal([b.A for b in blocks]), _block([[b.B] for b in blocks])
-    return Lti(A, B, _block_diagonal([b.C for b in blocks]), D, T)
+    A, B = block_diagonal([b.A for b in blocks]), _block([[b.B] for b in blocks])
+    return Lti(A, B, block_diagonal([b.C for b in blocks]), D, T)
 
 
 def hstack(*blocks: Any) -> Any:
@@ -648,7 +645,7 @@ def hstack(*blocks: Any) -> Any:
     if isinstance(first, Sampled):
         return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
-    A, B = _block_diagonal([b.A for b in blocks]), _block_diagonal([b.B for b in blocks])
+    A, B = block_diagonal([b.A for b in blocks]), block_diagonal([b.B for b in blocks])
     joined = Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
     return _with_parts(joined, lambda: tuple(_block([parts]) for parts in zip(*(b._rest for b in blocks), strict=True)))
 
@@ -683,7 +680,7 @@ def taps(weights: Sequence[Any], T: Number) -> Lti:
     return Lti(np.eye(n, k=-1, dtype=int), first, row[1:].reshape(1, n), row[:1].reshape(1, 1), T)
 
 
-def _block_diagonal(parts: Sequence[Array]) -> Array:
+def block_diagonal(parts: Sequence[Array]) -> Array:
     """Return the block-diagonal matrix of the parts, in any arithmetic and for any stack."""
     lead = np.broadcast_shapes(*(p.shape[:-2] for p in parts)) if any(p.ndim > 2 for p in parts) else ()
     shape = sum(p.shape[-2] for p in parts), sum(p.shape[-1] for p in parts)
@@ -715,10 +712,6 @@ def _floats(value: ArrayLike, name: str) -> Array:
         raise _unlike(name, value, 2, f", got shape {array.shape}")
     array.setflags(write=False)
     return array
-
-
-def _identity(G: Lti) -> Array:
-    return eye(G.order, G.T)
 
 
 def _common_period(*blocks: Lti) -> Any:

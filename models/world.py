@@ -26,9 +26,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.controller.lti import Array, block_diagonal
 from haptic_loop.models.scene import quiet_warnings
-
-Array = NDArray[np.floating[Any]]
 
 _CONTACT_MASS = 0.03  # [kg] mass of a contact for which the scene states no mass; a density does not count
 ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
@@ -191,7 +190,7 @@ class World:
         self.model = _compiled(spec, self.path)
         _off_rest(self.model)
         self.xml = spec.to_xml()
-        self._Q, self._g = _blockdiag(rotations), np.concatenate(springs)  # u = Q q
+        self._Q, self._g = block_diagonal(rotations), np.concatenate(springs)  # u = Q q
         joints = [self.model.joint(_name(c, a)) for c in self.contacts for a in range(len(c.along))]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dof = np.array([joint.dofadr[0] for joint in joints])
@@ -295,7 +294,7 @@ class World:
 
     def parts(self) -> list[_Part]:
         """Return the kinds of parts in the scene, with the bound on the energy of each (docs/worlds.md)."""
-        return list(_parts(self.model, set(self._joint.tolist())))
+        return _parts(self.model, set(self._joint.tolist()))
 
 
 def _lifted_by_actuators(m: mujoco.MjModel) -> NDArray[np.bool_]:
@@ -444,15 +443,6 @@ def _off_rest(model: mujoco.MjModel) -> None:
     exact &= model.tendon_lengthspring[:, 0] == model.tendon_lengthspring[:, 1]
     length = model.tendon_lengthspring[exact]
     model.tendon_lengthspring[exact] = np.where(length == 0, 1e-12, length * (1 + 1e-12))
-
-
-def _blockdiag(blocks: Sequence[Array]) -> Array:
-    size = sum(len(block) for block in blocks)
-    matrix, at = np.zeros((size, size)), 0
-    for block in blocks:
-        matrix[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return matrix
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -604,8 +594,7 @@ class Rows:
     """The constraint rows of the last step, grouped by contact or other constraint."""
 
     force: Array  # (rows,) [N]
-    before: Array  # (rows,) w, the speed before the step [m/s]
-    after: Array  # (rows,) w+
+    after: Array  # (rows,) w+, the speed after the step [m/s]
     depth: Array  # (rows,) r, negative inside [m]
     D: Array  # (rows,) inverse regularisation of the row's law f = -D ((w+ - w)/h + b w+ + K (r + h w+)) [kg]
     K: Array  # (rows,) reference stiffness [1/s^2]
@@ -627,7 +616,7 @@ class Rows:
         new[1:] = (kind[1:] != kind[:-1]) | (number[1:] != number[:-1])
         one_sided = kind > _TWO_SIDED
         depth = data.efc_pos - data.efc_margin
-        return cls(data.efc_force, data.efc_vel, after, depth, D, K, b, np.flatnonzero(new), one_sided)
+        return cls(data.efc_force, after, depth, D, K, b, np.flatnonzero(new), one_sided)
 
     def _stored(self, depth: Array) -> Array:
         inside = np.where(self.one_sided, np.minimum(depth, 0.0), depth)
@@ -640,10 +629,6 @@ class Rows:
         """
         rows = h * self.force * self.after + self._stored(self.depth + h * self.after) - self._stored(self.depth)
         return np.add.reduceat(rows, self.first)
-
-    def bound(self, h: float) -> Array:
-        """Return the lemma's bound [J] on the excess: the sum of D w^2/(4 (1 + b h)) over the rows of a constraint."""
-        return np.add.reduceat(self.D * self.before**2 / (4 * (1 + self.b * h)), self.first)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -659,52 +644,42 @@ _TURNING = "small in measurements of slow motion; the shell bounds it"
 _SHELL = "the shell only"
 
 
-def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[_Part]:
+def _parts(m: mujoco.MjModel, slides: set[int]) -> list[_Part]:
     joints = [i for i in range(m.njnt) if i not in slides]
     soft = {*m.flex_vertbodyid.tolist(), *m.flex_nodebodyid.tolist()}  # points of soft bodies
     movable, turns = set(m.jnt_bodyid[joints].tolist()) - soft, np.zeros(m.nbody, dtype=bool)
     turns[m.jnt_bodyid[m.jnt_type != mujoco.mjtJoint.mjJNT_SLIDE]] = True
     for body in range(1, m.nbody):  # parents come before their children
         turns[body] |= turns[m.body_parentid[body]]
-    turning = sum(bool(turns[body]) for body in movable)
-    if len(movable) > turning:
-        yield _Part("bodies that translate", len(movable) - turning, _NONE)
-    if turning:
-        yield _Part("bodies that turn", turning, _TURNING)
-    springs = int((m.jnt_stiffness[joints] != 0).sum())
-    if springs:
-        yield _Part("joint springs", springs, _NONE)
+    turning = int(turns[list(movable)].sum())
     constants = (m.jnt_stiffness, m.tendon_stiffness, m.dof_damping, m.tendon_damping)
-    negative = sum(int((values < 0).sum()) for values in constants)
-    if negative:
-        yield _Part("springs and dampers of negative constants", negative, _SHELL)
     higher = (m.jnt_stiffnesspoly, m.tendon_stiffnesspoly, m.dof_dampingpoly, m.tendon_dampingpoly)
-    curved = sum(int((values != 0).any(axis=1).sum()) for values in higher)
-    if curved:
-        yield _Part("springs and dampers that are not linear", curved, _SHELL)
     yielding = int((m.jnt_springyield != 0).sum() + (m.tendon_springyield != 0).sum())
-    if yielding:
-        yield _Part("springs that yield", yielding, _SHELL)
-    if m.ntendon:
-        yield _Part("tendons", m.ntendon, _SMALL)
     rubbing = int((m.dof_frictionloss > 0).sum() + (m.tendon_frictionloss > 0).sum())
-    if rubbing:
-        yield _Part("friction losses", rubbing, _ROW)
     limited = [i for i in joints if m.jnt_limited[i]]
-    if limited:
-        constant = all(m.jnt_solimp[i, 0] == m.jnt_solimp[i, 1] for i in limited)
-        yield _Part("joint limits", len(limited), _BOUNDED if constant else _VARYING)
+    constant_limits = bool((m.jnt_solimp[limited, 0] == m.jnt_solimp[limited, 1]).all())
     solid = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
-    if solid.any():
-        constant = bool((m.geom_solimp[solid, 0] == m.geom_solimp[solid, 1]).all() and not m.geom_margin[solid].any())
-        constant &= bool((m.pair_solimp[:, 0] == m.pair_solimp[:, 1]).all()) and not m.pair_margin.any()
-        constant &= not m.pair_solreffriction.any() and not m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
-        name = "geoms in contact, " + ("constant impedance" if constant else "other impedance, margin or friction")
-        yield _Part(name, int(solid.sum()), _BOUNDED if constant else _VARYING)
-    if m.neq:
-        yield _Part("equality constraints", m.neq, _SMALL)
-    if m.nflex:
-        yield _Part("soft bodies", m.nflex, _SMALL)
-    active = {"actuators": m.nu, "motion capture": m.nmocap, "plugins": m.nplugin}
-    active["wind"] = int(m.opt.wind.any() and (m.opt.density > 0 or m.opt.viscosity > 0))
-    yield from (_Part(what, count, _SHELL) for what, count in active.items() if count)
+    constant = bool((m.geom_solimp[solid, 0] == m.geom_solimp[solid, 1]).all() and not m.geom_margin[solid].any())
+    constant &= bool((m.pair_solimp[:, 0] == m.pair_solimp[:, 1]).all()) and not m.pair_margin.any()
+    constant &= not m.pair_solreffriction.any() and not m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
+    contacts = "constant impedance" if constant else "other impedance, margin or friction"
+    wind = int(m.opt.wind.any() and (m.opt.density > 0 or m.opt.viscosity > 0))
+    parts = (
+        _Part("bodies that translate", len(movable) - turning, _NONE),
+        _Part("bodies that turn", turning, _TURNING),
+        _Part("joint springs", int((m.jnt_stiffness[joints] != 0).sum()), _NONE),
+        _Part("springs and dampers of negative constants", sum(int((c < 0).sum()) for c in constants), _SHELL),
+        _Part("springs and dampers that are not linear", sum(int((c != 0).any(axis=1).sum()) for c in higher), _SHELL),
+        _Part("springs that yield", yielding, _SHELL),
+        _Part("tendons", m.ntendon, _SMALL),
+        _Part("friction losses", rubbing, _ROW),
+        _Part("joint limits", len(limited), _BOUNDED if constant_limits else _VARYING),
+        _Part(f"geoms in contact, {contacts}", int(solid.sum()), _BOUNDED if constant else _VARYING),
+        _Part("equality constraints", m.neq, _SMALL),
+        _Part("soft bodies", m.nflex, _SMALL),
+        _Part("actuators", m.nu, _SHELL),
+        _Part("motion capture", m.nmocap, _SHELL),
+        _Part("plugins", m.nplugin, _SHELL),
+        _Part("wind", wind, _SHELL),
+    )
+    return [part for part in parts if part.count]
