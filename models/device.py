@@ -64,7 +64,19 @@ def _listed(value: Any) -> Any:
 
 
 class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """Properties that both kinds of devices share; the subclasses declare the fields."""
+    """The fields and properties that both kinds of devices have."""
+
+    damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
+    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
+    encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
+    friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
+    friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
+    delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
+    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
+    # From a study's abstract: teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
+    guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use; refused for a rigid device
+    axes: int = 1  # 1 to 3: x, y, z
+    clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
     @property
     def passivity_level(self: Any) -> float:
@@ -76,22 +88,22 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return msgspec.structs.replace(self, damping=damping, delta=None)
 
     @property
-    def free(self: Any) -> tuple[int, ...]:
+    def free(self) -> tuple[int, ...]:
         """The axes that are not clamped, counted from 0: one channel each."""
         return tuple(i for i, axis in enumerate(AXES[: self.axes]) if axis not in self.clamped)
 
     @property
-    def axis_names(self: Any) -> tuple[str, ...]:
+    def axis_names(self) -> tuple[str, ...]:
         """The endings of the names of joints and contacts: ".x" and so on, or "" if the device has one axis."""
         return tuple(f".{AXES[i]}" for i in self.free) if self.axes > 1 else ("",)
 
-    def matrix(self: Any, field: str) -> _Matrix:
+    def matrix(self, field: str) -> _Matrix:
         """Return `damping`, or with field "delta" the guaranteed damping, as a matrix over the free axes [N s/m]."""
         value = self.passivity_level if field == "delta" else self.damping
         return symmetric(field, value, self.axes)[np.ix_(self.free, self.free)]
 
     @property
-    def ball(self: Any) -> bool:
+    def ball(self) -> bool:
         """Whether `force_limit` bounds the length of the force vector instead of the force on each axis."""
         return isinstance(self.force_limit, Real) and len(self.free) > 1
 
@@ -120,21 +132,10 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     """
 
     motor_mass: float = 0.06  # [kg] assumed; motor and handle have 0.25 kg together
-    damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
     handle_mass: float = 0.19  # [kg] assumed
     transmission_stiffness: float = 14500.0  # [N/m] assumed: puts the structural mode near 90 Hz
     transmission_damping: float = 0.0  # [N s/m] assumed
-    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
-    encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
-    friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
-    friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
-    delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
-    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
-    # From a study's abstract: teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
-    guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use
-    axes: int = 1  # 1 to 3: x, y, z
-    clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
     file: ClassVar[str] = "compliant"  # The MJCF file is models/{file}.xml.
 
@@ -174,16 +175,6 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     """Motor, encoder and handle as one body."""
 
     mass: float = 0.25  # [kg] assumed
-    damping: _Levels = 1.37  # [N s/m] the paper's section 6
-    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
-    encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
-    friction: _PerAxis = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it, axis by axis
-    friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
-    delta: _Levels | None = None  # [N s/m] guaranteed damping; None: `damping`
-    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed
-    guaranteed: DeviceBounds | None = None  # refused, since a rigid device has no transmission
-    axes: int = 1  # 1 to 3: x, y, z
-    clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
     file: ClassVar[str] = "rigid"
     transmission: ClassVar[None] = None
