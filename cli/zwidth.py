@@ -6,7 +6,7 @@ Flow of data: options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> fil
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import msgspec
 import numpy as np
@@ -238,7 +238,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
     simulation = report.simulation
     if report.fixed:
         yield from report.fixed.remarks
-        yield _about(report.conditions)
+        yield "K and B belong to every contact spring; a sweep certifies each cell for its environment alone."
     if report.claim:
         yield f"{report.claim}."
     for name in report.conditions:
@@ -258,17 +258,6 @@ def _remarks(report: MapReport) -> Iterator[str]:
         )
     if report.interrupted:
         yield "Interrupted: the map shows the finished parts."
-
-
-def _about(conditions: Sequence[str]) -> str:
-    """State which springs have K and B, and for which environment a cell is certified."""
-    line = "K and B belong to every contact spring; a sweep certifies each cell for its environment alone"
-    if zwidth.MODEL_KEPT not in conditions:
-        return f"{line}."
-    return (
-        f"{line}. In this-environment, the population and MuJoCo the coupling has a model of the cell's environment; "
-        f"for {zwidth.MODEL_KEPT} it has a model of the scenario's environment."
-    )
 
 
 def _span(axis: Array) -> str:

@@ -3,8 +3,7 @@
 A coupling has a compliance V(z) from force to displacement. In negative feedback around the delayed environment Psi E,
 the displacements x of the devices become u = x - V f, and f = Psi E u. `around` returns this loop,
 G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems, Fractions, or sampled responses
-(controller.lti). The V of an `_InternalModel` depends on Psi E, and a `ForceFilter` filters forces instead. A coupling
-is stored in a file as a `Form`.
+(controller.lti). A `ForceFilter` filters forces instead. A coupling is stored in a file as a `Form`.
 """
 
 from __future__ import annotations
@@ -70,10 +69,6 @@ class Coupling:
         assert V is not None
         return Sampled.of(V, z)
 
-    def with_model(self, model: Lti) -> Compliance | None:
-        """Return the `Compliance` of an internal-model coupling that contains `model`; None for other couplings."""
-        return None
-
     def at_period(self, T: float) -> Coupling:
         """Return the coupling with the same gains or coefficients and the period T [s]."""
         return self
@@ -94,7 +89,7 @@ class Coupling:
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
-        """Return the entries of a report: the order of V, of Q (internal model) or of R (filter), and gains if any."""
+        """Return the entries of a report: the order of V, or of R (filter), and gains if any."""
         V = self.compliance(T)
         return {"order": V.order if V else 0}
 
@@ -346,66 +341,11 @@ def _decimals(M: Array, digits: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _InternalModel(ReadOnly, Coupling):
-    """Internal model control with a parameter Q(z): u = x - Q y, where y = Psi E x is the output of the model.
-
-    The loop G = Psi E - Psi E Q Psi E is that of V = Q (I - Psi E Q)^-1 in feedback. G is affine in Q, and stable if Q
-    and the environment are. Q(z) = sum_k Q_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, so that
-    Q(1) is the sum of the coefficients.
-    """
-
-    poles: Array  # (n,) in (-1, 1); if all are zero, Q is an FIR filter of n + 1 taps
-    Q: Array  # (n + 1, m, m) [m/N]
-
-    kind, holds_model, one_period = "internal-model", True, True
-
-    if TYPE_CHECKING:
-
-        def __init__(self, poles: ArrayLike, Q: ArrayLike) -> None: ...
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "poles", frozen(self.poles, 1, "poles"))
-        object.__setattr__(self, "Q", frozen(self.Q, 3, "Q"))
-        functions, rows, columns = self.Q.shape
-        if functions != self.poles.size + 1 or rows != columns:
-            raise ValueError(f"Q has shape {self.Q.shape}, expected ({self.poles.size + 1}, channels, channels)")
-        if not (np.abs(self.poles) < 1).all():
-            raise ValueError(f"poles are {self.poles.tolist()}, expected numbers between -1 and 1")
-        if not np.isfinite(self.Q).all():
-            raise ValueError("Q has entries that are not finite")
-
-    def parameter(self, T: Number) -> Lti:
-        """Return Q(z), realised with one chain of sections per input."""
-        return _realised(self.poles, NO_PAIRS, self.Q, T)
-
-    def with_model(self, model: Lti) -> Compliance:
-        return Compliance(self.parameter(model.T).feedback(-model))
-
-    def figures(self, T: float) -> dict[str, Any]:
-        return {"order": self.parameter(T).order}
-
-    def around(self, environment: Block, further: int = 0) -> Block:
-        m = self.Q.shape[1]
-        if isinstance(environment, Sampled):
-            Q = Sampled(environment.z, np.tensordot(basis(self.poles, environment.z), self.Q, axes=1), environment.T)
-            return environment - environment @ (Q @ environment)
-        if further:
-            raise ValueError("the linear model inside the coupling cannot include the walls of the environment")
-        if environment.inputs != m or environment.outputs != m:
-            raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
-        T = environment.T
-        return environment @ (Lti.constant(np.eye(m), T) - self.parameter(T) @ environment)
-
-    def form(self) -> _InternalModelForm:
-        return _InternalModelForm(tuple(self.poles.tolist()), tuple(_rows(q) for q in self.Q))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
 class ForceFilter(ReadOnly, Coupling):
     """A filter R(z) of the environment's forces: F = Theta R Psi E.
 
-    There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
-    loop of `_InternalModel`. R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
+    There is no feedback, so F is stable if R and the environment are, and F is affine in R.
+    R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
     coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric if E(1) is.
     R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 
@@ -662,25 +602,6 @@ class _ComplianceForm(_Form, frozen=True, tag="compliance"):
         return Compliance(Lti(*tables, D, T))
 
 
-class _InternalModelForm(_Form, frozen=True, tag="internal-model"):
-    poles: tuple[float, ...]  # (n,)
-    Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
-
-    def __post_init__(self) -> None:
-        if any(len(rows) != len(self.Q[0]) or any(len(row) != len(rows) for row in rows) for rows in self.Q):
-            raise ValueError("Q has coefficients that are not square matrices of one size")
-        for rows in self.Q:
-            _require_sensible("Q", rows)
-        super().__post_init__()
-
-    @property
-    def shape(self) -> tuple[str, int, int]:
-        return "Q", len(self.Q[0]), len(self.Q[0])
-
-    def build(self, T: float) -> _InternalModel:
-        return _InternalModel(self.poles, self.Q)
-
-
 class _ForceFilterForm(_Form, frozen=True, tag="force-filter"):
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)
@@ -699,15 +620,7 @@ class _ForceFilterForm(_Form, frozen=True, tag="force-filter"):
         return ForceFilter(self.poles, self.pairs, self.R)
 
 
-Form = (
-    _NoForm
-    | _SpringDamperForm
-    | _MatrixSpringDamperForm
-    | _MovingAverageForm
-    | _ComplianceForm
-    | _InternalModelForm
-    | _ForceFilterForm
-)
+Form = _NoForm | _SpringDamperForm | _MatrixSpringDamperForm | _MovingAverageForm | _ComplianceForm | _ForceFilterForm
 
 
 def require_channels(form: Form, m: int) -> None:

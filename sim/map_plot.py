@@ -18,7 +18,7 @@ from haptic_loop.design.result import ANY, GUARD, TITLES, suffices
 from haptic_loop.sim import plots
 from haptic_loop.sim.limit_cycles import UNDECIDED
 from haptic_loop.sim.stability import MARGINAL
-from haptic_loop.sim.zwidth import MODEL_KEPT, Map
+from haptic_loop.sim.zwidth import Map
 from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # colours of areas
@@ -29,7 +29,6 @@ _LINES: dict[str, dict[str, Any]] = {
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
     "known-device": plots.STYLES[1] | {"linestyle": "-", "linewidth": 3.6},
     "known-device-any": plots.STYLES[4] | {"linestyle": "--", "linewidth": 1.8},
-    MODEL_KEPT: plots.STYLES[3] | {"linewidth": 1.8},
 }
 _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # line of a user's own condition
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller import environment
-from haptic_loop.controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import Compliance, Coupling, SpringDamper
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
@@ -43,8 +43,6 @@ from haptic_loop.sim import limit_cycles
 from haptic_loop.sim.run import Progress
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import MARGINAL
-
-MODEL_KEPT = "model kept"  # the second case of `EnvironmentSweep`, listed beside the conditions
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +167,7 @@ class CouplingSweep(_Sweep):
 class EnvironmentSweep(_Sweep):
     """A sweep over K and B of every spring at a contact, for a fixed coupling.
 
-    An optimal coupling is a fixed filter R with a model of the cell's environment E: F = Theta R Psi E. A
-    coupling of kind internal-model is a fixed Q and a model of the environment, with two cases:
-
-        this-environment   the model is the cell's E: F = Theta (Psi E - Psi E Q Psi E), as with ranges
-        model kept         the model is the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
+    An optimal coupling is a fixed filter R with a model of the cell's environment E: F = Theta R Psi E.
 
     Raises ValueError if the network has walls or a block, or no spring at a contact.
     """
@@ -200,7 +194,7 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        return (*self.judges, MODEL_KEPT) if self._model_kept else tuple(self.judges)
+        return tuple(self.judges)
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -219,7 +213,7 @@ class EnvironmentSweep(_Sweep):
         """Return required over available damping (n,); inf if the condition does not apply, or no damping is enough."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
-        shares = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
+        shares = self.judges[condition].ratios(self._at(K, B), self.coupling)
         return self._one_by_one(condition, K, B) if shares is None else shares
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
@@ -228,7 +222,7 @@ class EnvironmentSweep(_Sweep):
         network, varied = self.loop.network, contact_springs(self.loop.network)
         springs = [msgspec.structs.replace(s, stiffness=K, damping=B) if s in varied else s for s in network.springs]
         cell = self.loop.at(msgspec.structs.replace(network, springs=tuple(springs)))
-        return self._judge(condition).judge(cell, self._facing(condition))
+        return self.judges[condition].judge(cell, self.coupling)
 
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
@@ -240,16 +234,6 @@ class EnvironmentSweep(_Sweep):
                 loop = self.loop
                 requirements[name] = refusal(name, loop.delta, reason) if reason else each.judge(loop, self.coupling)
         return requirements
-
-    def _judge(self, condition: str) -> Condition:
-        return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.judges[condition]
-
-    def _facing(self, condition: str) -> Coupling:
-        return (self._model_kept if condition == MODEL_KEPT else None) or self.coupling
-
-    @cached_property
-    def _model_kept(self) -> Coupling | None:
-        return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
     def _at(self, K: Array, B: Array) -> Loop:
         """Return the loop with a stack of environments, for K and B (n,)."""

@@ -20,7 +20,7 @@ from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL
 from haptic_loop.sim.trace import slowest_seen
-from haptic_loop.sim.zwidth import MODEL_KEPT, Map, MapError, Mark, Sweep, contact_springs, map_error
+from haptic_loop.sim.zwidth import Map, MapError, Mark, Sweep, contact_springs, map_error
 
 _NOT_REACHED = "not reached before the interruption"
 
@@ -31,7 +31,7 @@ class _Ratio:
 
     required_over_available: Array  # (rows, columns) required over available damping
     certified_cells: int
-    contradicted_cells: int | None = off_table("if given")  # number of certified cells that are unstable with a human
+    contradicted_cells: int  # number of certified cells that are unstable with a human
     reason: str | None = off_table("if given")  # why some cells have no figure
 
 
@@ -237,7 +237,7 @@ class MapReport:
 
 def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
     ratio = drawn.ratio[name]
-    contradicted = int((suffices(ratio) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
+    contradicted = int((suffices(ratio) & (drawn.growth > MARGINAL)).sum())
     return _Ratio(ratio.reshape(drawn.grid.shape), int(suffices(ratio).sum()), contradicted, _nulls(sweep, drawn, name))
 
 

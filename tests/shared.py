@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from haptic_loop.controller.coupling import ForceFilter, SpringDamper, _InternalModel
+from haptic_loop.controller.coupling import ForceFilter, SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
@@ -82,19 +82,12 @@ SOFT_NETWORK = Network(
     (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
     {"mass": 1.0},
 )
-#: an internal-model coupling: a diagonal Q of eight coefficients, designed for the vertices of omega-pair-ranges only
-POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
-DIAGONAL = (
-    (-3.6184269801e-05, -2.9144270496e-05),
-    (0.000102208762709, 0.000107901901795),
-    (-7.4892424558e-05, 0.000122368778376),
-    (-3.3979578197e-05, -0.000118115991834),
-    (1.5604976381e-05, -2.036782868e-05),
-    (-2.2851948999e-05, 1.6201929781e-05),
-    (-5.3162829524e-05, 7.7158066584e-05),
-    (-0.000183213977119, 0.000179575913546),
+#: a filter with a resonance at 41 rad/s: certified at the vertices of omega-pair-ranges, but not between them
+VERTICES_ONLY = ForceFilter(
+    (),
+    [(-1.986289, 0.988713)],
+    [np.diag(row) for row in ((0.152927, 0.138856), (0.48123, -0.085068), (-0.495127, 0.085242))],
 )
-VERTICES_ONLY = _InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
 
 
 def force_map(E, coupling, theta, psi):

@@ -9,7 +9,7 @@ import pytest
 from evaluate import any_environment, this_environment
 from scipy.linalg import expm
 
-from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel
+from haptic_loop.controller.coupling import Compliance, ForceFilter, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
@@ -299,7 +299,7 @@ def test_longer_periods_scale_wall_requirements():
 def test_uncovered_wall_couplings_are_refused():
     loop = held(3000.0)
     with pytest.raises(NotProved, match="cannot include the walls"):
-        prove(loop, _InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
+        prove(loop, ForceFilter((), (), [[[1.0]]]), "this-environment")
     one_way = Compliance(Lti.constant([[1e-3, 5e-4], [0.0, 1e-3]], PAIR.T))
     assert "not symmetric" in required_damping(PAIR, one_way, "this-environment").reason
     judged = requirements_of(pressed_at_rest(), SpringDamper([1300.0], [0.45]))

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from shared import VERTICES_ONLY
 
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.options import DONE
@@ -81,28 +80,6 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, K, B, optimal):
     ratio = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
     assert ratio == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
     assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(ratio, rel=1e-6)
-
-
-def test_a_kept_model_is_the_scenarios_environment():
-    """The map's third case keeps the coupling V = Q (I - E0 Q)^-1 with the scenario's E0 in every cell.
-
-    Where a cell's environment is not E0, its ratio therefore differs from that of this-environment.
-    """
-    coupling = VERTICES_ONLY
-    sweep = around(PAIR, coupling)
-
-    def kept(z, E):
-        M, D, S = PAIR.environment.matrices()
-        s = ((z - 1) / (PAIR.T * z))[:, None, None]
-        E0, Q = np.linalg.inv(np.linalg.inv(M * s**2 + D * s + S)[:, :2, :2]), coupling.parameter(PAIR.T).at(z)
-        V = Q @ np.linalg.inv(np.eye(2) - E0 @ Q)
-        return np.linalg.solve(np.eye(2) + E @ V, E)
-
-    any_, this, behind = (sweep.ratios(name, np.array([300.0]), np.array([0.5]))[0] for name in sweep.conditions)
-    assert behind == pytest.approx(densely(sweep, kept, 300.0, 0.5), rel=1e-5)
-    assert behind != pytest.approx(this, rel=1e-4)
-    assert np.isinf(any_)
-    assert "only couplings without one" in sweep.refusals["any-environment"]
 
 
 def test_bare_walls_match_colgates_condition():

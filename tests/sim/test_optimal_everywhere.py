@@ -16,7 +16,7 @@ import pytest
 from shared import VERTICES_ONLY
 
 from haptic_loop.cli import export, run, validate
-from haptic_loop.controller.coupling import ForceFilter, _InternalModel
+from haptic_loop.controller.coupling import ForceFilter
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Sampled
 from haptic_loop.design.certificate import prove, verify
@@ -73,7 +73,7 @@ def test_coupling_files_prove_and_drive_the_process(file_of, form):
     scenario, _, path = file_of(form)
     stored, loop = load_file(path), scenario.loop("I")
     assert verify(stored).proved
-    assert isinstance(stored.built(), _InternalModel if form == "pair" else ForceFilter)
+    assert isinstance(stored.built(), ForceFilter)
     strong = tuple(msgspec.structs.replace(device, force_limit=1e4) for device in scenario.device)
     simulation = assemble(scenario.replace(device=strong, duration=0.2), stored.built(), None)
     exact, own = (close_loop(simulation, engine) for engine in ("exact", "mujoco"))
