@@ -1,4 +1,4 @@
-"""Files are written completely or not at all, and pipes directly; a full disk gives one error line."""
+"""Regular files are written completely or not at all, pipes are written directly, and a full disk gives one line."""
 
 import errno
 import os

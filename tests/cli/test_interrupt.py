@@ -53,7 +53,7 @@ def test_an_interrupted_comparison_reports_nothing(tmp_path):
 
 
 def interrupt(monkeypatch, simulation, blocks=1):
-    """Let Ctrl-C come in the command's simulation of the number `simulation`, after `blocks` of its blocks."""
+    """Let Ctrl-C come in the command's simulation number `simulation`, after its first `blocks` blocks."""
     run_blocks, numbers = loop.run_blocks, count(1)
 
     def interrupted(process, engine, outside, ticks, start, keep, block):

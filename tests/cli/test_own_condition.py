@@ -118,7 +118,7 @@ def test_a_file_without_its_condition_is_explained(folder, monkeypatch):
 )
 def test_designs_without_own_conditions_are_refused(words, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("haptic_loop.design.api.instead", lambda *failed: "")  # It would design other couplings.
+    monkeypatch.setattr("haptic_loop.design.api.instead", lambda *failed: "")  # `instead` would design other couplings.
     with pytest.raises(ValueError, match=message) as caught:
         run("design", *words)
     assert "\n" not in str(caught.value)

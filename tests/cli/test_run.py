@@ -75,7 +75,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
-    """The default is the more exact design; any-environment renders only half of the environment's stiffness."""
+    """A design for this environment is more exact: one for any environment renders only half of its stiffness."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10", "--no-plot")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"
