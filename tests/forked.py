@@ -112,7 +112,7 @@ def _cached(folder: Path, make):
 
 
 def _arguments(make, loop, *arguments, **options) -> list[tuple[str, str]]:
-    """Return (name, text) of each argument but loop and functions; equal calls give equal texts."""
+    """Return (name, text) of each argument except loop and functions; equal calls give equal texts."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT

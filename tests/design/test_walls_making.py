@@ -234,7 +234,7 @@ class Walled:
 @pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True], ids=["springs", "dampers"])
 def test_the_balance_of_z_holds_at_ticks(damped):
-    """On random motions of the running law the balance of Z holds at every tick, and Z >= min(0, its first value)."""
+    """On random motions of the running law the balance of the storage Z holds at every tick; Z >= min(0, first Z)."""
     rng, loop = np.random.default_rng(0), DAMPED if damped else PAIR
     delta, _, block, P, S, m_ = steps_of(damped)
     there, ticks = Walled(loop, BOTH, block), 800
@@ -376,8 +376,8 @@ def test_damped_wall_designs_are_tight_and_proved():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damped", [pytest.param(False, marks=pytest.mark.validate), True], ids=["springs", "dampers"])
-def test_frozen_walls_fall_to_a_nonnegative_value(damped):
-    """With x held and the touched walls kept, even where they pull, Z falls from states of the loop to a value >= 0."""
+def test_storage_of_frozen_walls_falls_to_nonnegative_values(damped):
+    """With x held and the touched walls kept, even if they pull, the storage Z of a state falls to a value >= 0."""
     rng = np.random.default_rng(5)
     _, G, block, P, S, _ = steps_of(damped)
     there, frozen = Walled(DAMPED if damped else PAIR, BOTH, block), 0

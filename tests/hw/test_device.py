@@ -1,4 +1,4 @@
-"""The device follows docs/protocol.md: when forces act, what stops them, and what never starts them again."""
+"""The device follows docs/protocol.md: when forces act, what stops them, and what cannot start them again."""
 
 import pytest
 

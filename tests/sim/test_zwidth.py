@@ -326,7 +326,7 @@ def walled(count):
 
 @pytest.mark.parametrize("walls", [0, 1, 2])
 def test_batched_processes_equal_single_ones(walls):
-    """Processes in one buffer equal single ones but for rounding, since sums are in another order."""
+    """Processes in one buffer equal single ones except for rounding, because sums are in another order."""
     rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
     if walls:
         contacts = [walled(walls), walled(walls)]
@@ -348,7 +348,7 @@ def test_batched_processes_equal_single_ones(walls):
     assert np.abs(together.f).max() > 0.1
 
 
-def test_coulomb_friction_stops_a_device_where_coulomb_says():
+def test_coulomb_friction_stops_devices_at_the_exact_place():
     """m v' = -b v - F stops after m/b log(1 + b v0/F). MuJoCo may err by 3e-6 m (1.4e-6 m when measured)."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
