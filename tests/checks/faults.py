@@ -542,7 +542,7 @@ def _rehearse_case(
     free: bool = False,
     cap: float | None = STRONGEST,
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case; with `free` nobody holds the faulty device. `couplings` are couplings for a delay of one tick.
+    """Run one case; with `free` nobody holds the faulty device. `couplings` are for a delay of one tick.
 
     `cap` is the force cap [N] of the session; None for the default.
     """
