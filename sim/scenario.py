@@ -174,12 +174,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             return
 
         def each(name: str, values: Any) -> Any:
-            if values is None or values is _UNSAID or len(values) not in (len(counts), sum(counts)):
-                if values is None or values is _UNSAID:
-                    return values
-                raise ValueError(f"{name} has {len(values)} entries, expected {len(counts)}, one for each device")
+            if values is None:
+                return None
             if len(values) == len(counts):
                 return tuple(value for value, count in zip(values, counts, strict=True) for _ in range(count))
+            if len(values) != sum(counts):
+                raise ValueError(f"{name} has {len(values)} entries, expected {len(counts)}, one for each device")
             if any(value != values[first] for value, first in zip(values, self.lead, strict=True)):
                 raise ValueError(f"{name} is {list(values)}, expected one value for all axes of a device")
             return tuple(values)
@@ -283,15 +283,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(device.passivity_level for device in self.axis_devices)
 
     @property
-    def _axes(self) -> dict[str, Any]:
-        """The fields of a loop on devices with several axes; empty for one axis, to keep the loop's digest."""
-        counts = tuple(len(device.free) for device in self.device)
-        if max(counts) == 1:
-            return {}
+    def _levels(self) -> tuple[Any, ...] | None:
+        """The matrix of guaranteed damping of each device [N s/m] as rows of numbers; None if all are diagonal."""
         matrices = [device.matrix("delta") for device in self.device]
-        skew = any((matrix != np.diag(np.diag(matrix))).any() for matrix in matrices)
-        levels = tuple(tuple(map(tuple, matrix.tolist())) for matrix in matrices)
-        return {"axes": counts, "levels": levels} if skew else {"axes": counts}
+        if all((matrix == np.diag(np.diag(matrix))).all() for matrix in matrices):
+            return None
+        return tuple(tuple(map(tuple, matrix.tolist())) for matrix in matrices)
 
     @property
     def samples(self) -> int:
@@ -380,17 +377,24 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
         `case` is "none", "I" or "II"; raises InputError for another case.
         """
-        span = self.delay_range
-        varying = span if self.switches and span.lo != span.hi else None
-        delays = (self.theta, self.psi, self.reference_delays(case))
-        rest = (self.delta, _without_folder(self.environment), self.ranges, varying)
-        more = {**self._known(), **self._axes, "unit": self.unit}
-        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
-
-    def _known(self, channels: int | None = None) -> dict[str, Any]:
-        """Return fields of a loop on known devices; {} for other devices, so that their loops keep their digest."""
-        known = self.known_devices
-        return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
+        span, known, counts = self.delay_range, self.known_devices, tuple(len(device.free) for device in self.device)
+        return Loop(
+            T=self.T,
+            theta=self.theta,
+            psi=self.psi,
+            lam=self.reference_delays(case),
+            delta=self.delta,
+            environment=_without_folder(self.environment),
+            ranges=self.ranges,
+            varying_delay=span if self.switches and span.lo != span.hi else None,
+            T_max=self.longest_period,
+            latency=self.latency,
+            T_min=self.shortest_period if known else None,
+            known_devices=known,
+            axes=counts if max(counts) > 1 else None,
+            levels=self._levels,
+            unit=self.unit,
+        )
 
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
         """Return the loop of the first device alone before a rigid wall. Raises ValueError if psi is not 0.
@@ -403,8 +407,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             least = np.linalg.eigvalsh(self.device[0].matrix("delta"))[0]
             # The factor covers the rounding of eigvalsh.
             delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)
-        rest: dict[str, Any] = {"T_max": self.longest_period, "unit": self.unit, **self._known(1)}
-        return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
+        known, longest = self.known_devices, self.longest_period
+        more: dict[str, Any] = {"known_devices": known[:1], "T_min": self.shortest_period} if known else {}
+        return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, T_max=longest, unit=self.unit, **more)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """Return the scenario with some fields changed; `delta` is another guaranteed damping per device [N s/m].
@@ -772,7 +777,8 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Add path and digest of a world's MJCF file, and directions of contacts. Raises ValueError for a wrong world."""
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
-        _require_no_along(table)
+        if extra := [key for key in ("along", "every") if isinstance(table, dict) and key in table]:
+            raise ValueError(f"environment.{extra[0]} is allowed only with environment.world")
         return raw
     from haptic_loop.models.world import check_contacts, digest_of  # loads MuJoCo, which other scenarios do not need
 
@@ -806,12 +812,6 @@ def world_environment(table: dict[str, Any]) -> Network:
         return msgspec.convert(_with_world({"environment": table}, Path())["environment"], Network)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _require_no_along(environment: Any) -> None:
-    extra = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
-    if extra:
-        raise ValueError(f"environment.{extra[0]} is allowed only with environment.world")
 
 
 def _direction(number: int, row: Any) -> list[float]:

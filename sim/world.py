@@ -206,16 +206,14 @@ class Touched:
     """Settings of a net (sim.passivity_layer): the scenario's world behind coupling and energy shell."""
 
     start: float = START_J  # W0 [J]
-    gravity: bool = True  # False switches the scene's gravity off
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> InWorld:
         """Return a new net for `nsim` runs. Raises InputError if the loop cannot contain a world."""
-        V = simulation.coupling.compliance(simulation.loop.T)
-        if V is None or not V.D.any():
-            raise InputError(f"environment.world needs a coupling: {_no_spring(simulation.coupling)}")
+        scene = scene_of(simulation.scenario, simulation.coupling)
         if any(simulation.scenario.psi):
             raise InputError("psi: a world answers within the tick, so psi must be 0")
-        scene = scene_of(simulation.scenario, simulation.coupling, self.gravity)
+        V = simulation.coupling.compliance(simulation.loop.T)
+        assert V is not None  # `scene_of` has checked it.
         try:
             shell = Shell(V, start=self.start, nsim=nsim)
         except ValueError as error:

@@ -376,8 +376,7 @@ class LiveLoop:
         push = self._pushed.copy()
         if grip:
             push[list(grip.channels)] += grip.force(self.prepared.simulation.scene, self.state)
-        history = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
-        recent = self._history[-1:] if history is None else history
+        recent = self._history[-max(1, min(self._tick - first, len(self._history))) :]
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
         n, process = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process
         over, last = (at_limit(f[:, :, None], process.force_limit, process.balls)[:, :, 0] for f in (shown, recent))

@@ -74,21 +74,17 @@ def _colour(channel: int) -> _Colour:
     return _PALETTE[channel % len(_PALETTE)]
 
 
-def _devices(scene: Scene) -> int:
-    return 1 + max(scene.devices)
-
-
-def _own(scene: Scene, device: int) -> list[int]:
-    """Return the channels of a device."""
-    return [channel for channel, of in enumerate(scene.devices) if of == device]
+def _channels(scene: Scene) -> list[list[int]]:
+    """Return the channels of each device."""
+    return [[k for k, of in enumerate(scene.devices) if of == device] for device in range(1 + max(scene.devices))]
 
 
 def _owners(scene: Scene) -> tuple[int, ...]:
     """Return the device (from 0) of each joint; for a person's body, the first device that the person holds."""
-    owner = dict(enumerate(scene.devices))
-    for i, points in enumerate(scene.points[: _devices(scene)]):
+    owner, devices = dict(enumerate(scene.devices)), len(_channels(scene))
+    for i, points in enumerate(scene.points[:devices]):
         owner |= dict.fromkeys(points, i)
-    for points in scene.points[_devices(scene) :]:
+    for points in scene.points[devices:]:
         owner |= {joint: owner[points[0]] for joint in points if joint not in owner}
     return tuple(owner[joint] for joint in range(scene.model.njnt))
 
@@ -96,8 +92,8 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 def _places(scene: Scene) -> tuple[int, ...]:
     """Return the place of each joint's body in units of STEP: motor -1, handle 0, arm, then a person's body."""
     place = dict.fromkeys(range(scene.channels), -1)
-    for i, points in enumerate(scene.points[: _devices(scene)]):
-        place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
+    for own, points in zip(_channels(scene), scene.points, strict=False):
+        place |= {joint: k // len(own) for k, joint in enumerate(points)}
     behind = 1 + max(place.values())
     return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
 
@@ -196,7 +192,7 @@ class _ShownScene:
         self.model = _dressed(scene)
         self.data = mujoco.MjData(self.model)
         self.device = _owners(scene)  # joint -> device
-        self._channels = [_own(scene, device) for device in range(_devices(scene))]
+        self._channels = _channels(scene)
 
     def show(self, frame: Frame) -> None:
         """Set the joints to the positions of a frame."""
@@ -209,7 +205,7 @@ class _ShownScene:
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
-        channels = _own(self.scene, self.device[joint])
+        channels = self._channels[self.device[joint]]
         handles = np.array(self.scene.handles)[channels]
         turn = self.data.xmat[perturb.select].reshape(3, 3)
         held_at = self.data.xpos[perturb.select] + turn @ perturb.localpos
@@ -224,8 +220,8 @@ class _ShownScene:
             else:
                 kind = _BOX if shape.kind in ("mass", "wall") else _SPHERE
                 _solid(drawn, kind, shape.size, shape.at, shape.quat, shape.rgba)
-        for device in range(_devices(self.scene)):
-            channels, own = _own(self.scene, device), _colour(device)
+        for device, channels in enumerate(self._channels):
+            own = _colour(device)
             handles = np.array(self.scene.handles)[channels]
             axes, reach = self.model.jnt_axis[handles], _LONGEST / self.force_limit[channels]
             at = self.data.xpos[self.model.jnt_bodyid[handles[0]]] + np.array([0, 0, 0.045])
@@ -240,13 +236,11 @@ class _ShownScene:
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """Plot each device's forces of the last seconds, side by side at the bottom of a picture."""
-        m = len(self._channels)
-        width, height = picture.width // m, round(_PLOT * picture.height)
+        width, height = picture.width // len(self._channels), round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = _scale(frame.history, self.force_limit), []
-        for i in range(m):
+        for i, own in enumerate(self._channels):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
-            own = self._channels[i]
             drawn.append((place, _figure(i, low[:, own], high[:, own], top, frame.prepared.scenario.unit)))
         return drawn
 
@@ -289,7 +283,7 @@ class _ShownWorld(_ShownScene):
         self._x = self._by_device(frame.q)
 
     def _by_device(self, values: Array) -> list[Array]:
-        return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
+        return [values[own] for own in self._channels]
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
         """Return the grip of the mouse on a contact, in the directions in which the contact slides."""
@@ -308,7 +302,7 @@ class _ShownWorld(_ShownScene):
             own, tip = _colour(i), self._rest[i] + x @ along
             at, reach = tip + self._stylus[i], 25 * size / float(np.min(self.force_limit))
             _connect(drawn, _BAR, size / 5, tip, at, (*_GREY, 1.0))
-            _sphere(drawn, at, size, (*own, 1.0))
+            _solid(drawn, _SPHERE, np.full(3, size), at, np.array([1.0, 0.0, 0.0, 0.0]), (*own, 1.0))
             _connect(drawn, _ARROW, size / 3, at, at - reach * forces[i] @ along, (*own, 1.0))
             _connect(drawn, _ARROW, size / 4, at, at + reach * pushes[i] @ along, (0.1, 0.1, 0.1, 1.0))
 
@@ -350,16 +344,15 @@ def _dressed(scene: Scene) -> mujoco.MjModel:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(device), 1.0), **_MASSLESS)
         else:
             body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*_GREY, 1.0), **_MASSLESS)
-    deepest = max(1, *where)
-    devices = _devices(scene)
-    middle = [(deepest - 1) * STEP / 2, -APART * (devices - 1) / 2, 0.03]
-    for device in range(devices):
-        if len(_own(scene, device)) > 1:  # A device that moves in space needs no rail.
+    deepest, channels = max(1, *where), _channels(scene)
+    middle = [(deepest - 1) * STEP / 2, -APART * (len(channels) - 1) / 2, 0.03]
+    for device, own in enumerate(channels):
+        if len(own) > 1:  # A device that moves in space needs no rail.
             continue
         at, rail = [middle[0], -APART * device, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
     spec.stat.center = middle
-    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (devices - 1)
+    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (len(channels) - 1)
     return spec.compile()
 
 
@@ -400,10 +393,6 @@ def _shade(device: int, axis: int) -> _Colour:
 def _arrow(drawn: mujoco.MjvScene, at: Array, way: Array, rgba: tuple[float, ...]) -> None:
     if np.abs(way).max() > 1e-4:
         _connect(drawn, _ARROW, 0.005, at, at + way, rgba)
-
-
-def _sphere(drawn: mujoco.MjvScene, at: Array, radius: float, rgba: tuple[float, ...]) -> None:
-    _solid(drawn, _SPHERE, np.full(3, radius), at, np.array([1.0, 0, 0, 0]), rgba)
 
 
 def _solid(
@@ -538,7 +527,7 @@ class _FlatPictures:
 
     def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
         self.scene, self.force_limit, self.object = scene, force_limit, drawn
-        self._font = ImageFont.load_default(12)
+        self._channels, self._font = _channels(scene), ImageFont.load_default(12)
         places, owners, first = _places(scene), _owners(scene), dict[int, int]()
         for joint, body in enumerate(scene.model.jnt_bodyid.tolist()):
             first.setdefault(body, joint)
@@ -564,18 +553,17 @@ class _FlatPictures:
         """Free the renderer, if there is one."""
 
     def _scene(self, image: Image.Image, frame: Frame, top: int, bottom: int) -> None:
-        self._bodies(ImageDraw.Draw(image), frame, max(top, round(_WORDS * image.height)), bottom)
-
-    def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
+        """Draw bodies, object and forces between two rows of pixels, at least below the share _WORDS of the picture."""
+        pen, top = ImageDraw.Draw(image), max(top, round(_WORDS * image.height))
         steps, behind = max(place for _, place, _ in self._shapes) + 1, self.object.reach if self.object else 0.0
         left = max(_LONGEST + STEP, behind)  # [m] width of the picture to the left of the handles
         per_metre = (_SIZE[0] - 120) / (left + steps * STEP + _LONGEST)
-        origin, row = 60 + left * per_metre, (bottom - top) / _devices(self.scene)
+        origin, row = 60 + left * per_metre, (bottom - top) / len(self._channels)
         usual = min(14.0, 0.3 * row)
         self._object(pen, frame, origin, per_metre, top, row)
-        for i in range(_devices(self.scene)):
+        for i, own in enumerate(self._channels):
             y = top + (i + 0.5) * row
-            if len(_own(self.scene, i)) == 1:
+            if len(own) == 1:
                 pen.line((origin - (STEP + _LONGEST / 2) * per_metre, y, _SIZE[0] - 30, y), _LIGHT, 2)
         model = self.scene.model
         for body, place, i in self._shapes:
@@ -611,7 +599,7 @@ class _FlatPictures:
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
         """Draw range and mean of the force -f since the last frame, and the push; for several axes only the mean."""
-        channels = _own(self.scene, device)
+        channels = self._channels[device]
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
             reach = per_metre * _LONGEST / self.force_limit[channels]
@@ -628,10 +616,10 @@ class _FlatPictures:
 
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         """Draw one plot for each device, side by side."""
-        m, most, middle = _devices(self.scene), _scale(frame.history, self.force_limit), (top + bottom) / 2
+        most, middle = _scale(frame.history, self.force_limit), (top + bottom) / 2
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
-        width = (_SIZE[0] - 20) / m
-        for i in range(m):
+        width = (_SIZE[0] - 20) / len(self._channels)
+        for i, channels in enumerate(self._channels):
             left, right = 50 + i * width, (i + 1) * width - 2
             for value in (-most, 0.0, most):
                 y = middle - value / most * (bottom - top) / 2
@@ -640,7 +628,7 @@ class _FlatPictures:
             label = in_unit(f"force on device {i + 1} [N], last {HISTORY:g} s", frame.prepared.scenario.unit)
             pen.text((left, bottom + 2), label, _BLACK, self._font)
             x = np.linspace(left, right, _COLUMNS)
-            for axis, channel in enumerate(_own(self.scene, i)):
+            for axis, channel in enumerate(channels):
                 for j in np.flatnonzero(np.isfinite(low[:, channel])):
                     ends = middle - np.array([low[j, channel], high[j, channel]]) / most * (bottom - top) / 2
                     pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_shade(i, axis)), 2)
