@@ -258,22 +258,17 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         """Return F = Theta G (6) from displacements to forces at the devices. Raises SingularLoop."""
         return self.late(self.sent(coupling, exact))
 
-    def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return F with ports for the walls, from [x; p] to [f; y].
-
-        p are the forces [N] of the walls, and y the displacements [m] across them. Psi and Theta delay the effect of
-        p on f. Raises SingularLoop, and ValueError for a coupling that excludes walls.
-        """
-        return self._beside_walls(self.theta, exact) @ self.walled_before_delay(coupling, exact)
-
     def walled_before_delay(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the block of `walled` before Theta, from [x; p] to [f_e; y] with the sent forces f_e."""
-        E = walled_environment(self.network, self.period(exact))
-        return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
+        """Return the block of `sent` with ports for the walls, from [x; p] to [f_e; y] with the sent forces f_e.
 
-    def _beside_walls(self, steps: _Steps, exact: bool) -> Lti:
+        p are the forces [N] of the walls, and y the displacements [m] across them. Psi delays the effect of p on f_e.
+        Raises SingularLoop, and ValueError for a coupling that excludes walls.
+        """
+        if not (walls := len(self.environment.walls)):
+            return self.sent(coupling, exact)
         T = self.period(exact)
-        return Lti.diag(delay(steps, T), Lti.constant(np.eye(len(self.environment.walls)), T))
+        late = Lti.diag(delay(self.psi, T), Lti.constant(np.eye(walls), T))
+        return coupling.around(late @ walled_environment(self.network, T), further=walls)
 
     def law(
         self,
@@ -289,7 +284,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         that excludes walls.
         """
         walls = self.environment.walls
-        sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
+        sent = self.walled_before_delay(coupling)
         if limit is None or rho is None:
             return Law(sent, self.theta, walls)
         return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))

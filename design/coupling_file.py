@@ -82,7 +82,7 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
     built = coupling.form().build(loop.T)
     if type(built) is type(coupling):
         return coupling
-    through = loop.walled if loop.environment.walls else loop.sent
+    through = loop.walled_before_delay
     V, rebuilt = coupling.compliance(loop.T), built.compliance(loop.T)
     for method, own, other in (("around", through(coupling), through(built)), ("compliance", V, rebuilt)):
         if own is None:

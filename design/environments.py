@@ -333,7 +333,7 @@ class ThisEnvironment(Multiplied):
         return min(tried, key=lambda values: float(least_scale(self.block(G, loop, values), w).max()))
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        G = loop.walled_before_delay(coupling, exact) if loop.environment.walls else loop.sent(coupling, exact)
+        G = loop.walled_before_delay(coupling, exact)
         if exact:
             budgets.require_size(G.order + sum(loop.delays.hi))
         return G

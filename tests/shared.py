@@ -100,6 +100,13 @@ def undelayed_map(coupling) -> Lti:
     return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
 
 
+def walled(loop, coupling, exact=False):
+    """Return F with ports for the walls, from [x; p] to [f; y], with their forces p and the displacements y there."""
+    T, walls = loop.period(exact), len(loop.environment.walls)
+    late = Lti.diag(delay(loop.theta, T), Lti.constant(np.eye(walls), T))
+    return late @ loop.walled_before_delay(coupling, exact)
+
+
 def loop_of(network, theta, psi, period: float = T) -> Loop:
     """Return a loop whose damping and reference are arbitrary, because a tick does not depend on them."""
     return Loop(period, tuple(theta), tuple(psi), (0,) * len(theta), (1.0,) * len(theta), network)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluate import prove_limiter, this_environment
-from shared import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF, at_springs
+from shared import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF, at_springs, walled
 
 from haptic_loop.controller import coupling as controller_coupling
 from haptic_loop.controller.arithmetic import SingularLoop, numbers, rational, solve
@@ -501,7 +501,7 @@ def test_every_block_has_a_limit_of_states(monkeypatch):
             loop, coupling, ANY_ENVIRONMENT, None
         ),
         limited: lambda: design_certificate._blocks(loop, coupling, LIMITER, (1.0, 1.0)),
-        wall.walled(one).order + 2: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [1.0] * 4),
+        walled(wall, one).order + 2: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [1.0] * 4),
     }
     for states, make in blocks.items():
         monkeypatch.setattr(budgets, "PROOF_STATES", states - 1)

@@ -22,7 +22,7 @@ from evaluate import (
     walls_demand,
 )
 from scipy.optimize import minimize_scalar
-from shared import FIGURE_4, SOFT, STIFF, T, checkered
+from shared import FIGURE_4, SOFT, STIFF, T, checkered, walled
 
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
@@ -313,7 +313,7 @@ def test_walls_at_the_device_need_the_closed_form(theta, g):
     """The limit is (theta + 1 + g)^2 K T/(4 g + 2) with the multiplier g K; only the wall exerts a force."""
     wall = Wall(("tip", "ground"), 3000.0)
     network = Network(("tip",), (), walls=(wall,))
-    G = loop_of(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    G = walled(loop_of(network, (theta,)), Compliance(Lti.constant([[0.0]], T)), exact=True)
     limit = (theta + 1 + g) ** 2 * 3000.0 * T / (4 * g + 2)
     assert_limit(lambda d: summed(walls_demand(G, [d], [3000.0], [g * 3000.0])), limit)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from evaluate import any_environment, this_environment
 from scipy.linalg import expm
+from shared import walled
 
 from haptic_loop.controller.coupling import Compliance, ForceFilter, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
@@ -110,7 +111,7 @@ def test_without_m_the_requirement_has_closed_forms():
 
 def test_the_block_equals_its_definition():
     """The block equals (f) of docs/theory.md at four frequencies, for two channels and three walls."""
-    G, s = DAMPED.walled(BOTH), 0.9
+    G, s = walled(DAMPED, BOTH), 0.9
     k, b, _, _ = walls_by_hand(DAMPED)
     a, both, d, m = np.array([900.0, 500.0, 200.0]), np.array([700.0, 0, 900.0]), np.array([50.0, 0, 80]), [0.3, 0, 0.7]
     demand = THIS_ENVIRONMENT.block(DAMPED.walled_before_delay(BOTH), DAMPED, (*a, *both, *d, *m))
@@ -194,7 +195,7 @@ def steps_of(damped):
     block = demand.free + demand.gain
     P, reason = find_storage(block)
     assert P is not None, reason
-    G, m = loop.walled(BOTH), loop.channels
+    G, m = walled(loop, BOTH), loop.channels
     k = np.array([w.stiffness for w in loop.environment.walls])
     S1 = G.dc()
     S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
@@ -207,7 +208,7 @@ class Walled:
 
     def __init__(self, loop, coupling, block):
         self.loop, self.block, self.m = loop, block, loop.channels
-        self.G = loop.walled(coupling)
+        self.G = walled(loop, coupling)
         self.k, self.b, self.gap, _ = walls_by_hand(loop)
         self.tick, self.state = loop.law(coupling).transition(), np.zeros(self.G.order + len(self.k))
         self.h, self.e, self.s, self.x = (np.zeros(n) for n in (*(len(self.k),) * 3, self.m))
@@ -336,7 +337,7 @@ def swinging(loop, coupling, damping, ticks, seed=11):
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
     step, tick = np.ascontiguousarray(np.moveaxis(expm(A * loop.T)[:, :2], 0, 2)), loop.law(coupling).transition()
     plant = rng.standard_normal((HANDS, 2)).T * [[1e-2], [0.1]]
-    before, after = np.zeros((2, loop.walled(coupling).order + 2, HANDS))
+    before, after = np.zeros((2, walled(loop, coupling).order + 2, HANDS))
     contacts, touching, fastest = 0, np.zeros(HANDS, dtype=bool), 0.0
     for k in range(ticks):
         before[-1] = plant[0]
