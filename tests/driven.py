@@ -60,7 +60,7 @@ def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int =
 
 
 def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.random.Generator, ticks: int) -> int:
-    """Return how many hands' motions grow a hundredfold after the first tenth of the ticks.
+    """Return for how many hands the motion grows a hundredfold after the first tenth of the ticks.
 
     Each tick multiplies the state by one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average.
     Without `mean`, each hand takes the step after which `energy` (hands, 2) times [x^2, v^2] is largest.

@@ -225,7 +225,7 @@ HANDS, TICKS = 60, 6000
 
 
 def grown(damping, latencies, mean, seed=3):
-    """Return how many lossless hands gain a hundred times their energy between a tenth of the ticks and the end.
+    """Return for how many lossless hands the motion grows a hundredfold between a tenth of the ticks and the end.
 
     tau is one of `latencies` [s]. It is drawn anew after `mean` ticks on average. If `mean` is None, each tick has the
     tau that gives the hand most energy.
@@ -245,7 +245,7 @@ def grown(damping, latencies, mean, seed=3):
 
 
 @pytest.mark.parametrize("mean", [1, 100, pytest.param(None, marks=pytest.mark.slow)])
-def test_hands_gain_energy_only_below_the_requirement(mean):
+def test_motions_grow_only_below_the_requirement(mean):
     latencies = np.linspace(0, TAU, 3)
     need = required_damping(
         change(WALL, latency=((0.0, TAU),)), SpringDamper([1e9], [0.0]), "this-environment"

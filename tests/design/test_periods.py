@@ -153,7 +153,7 @@ def tick(F, A, B, period):
 
 
 def grown(damping, mean, seed=7):
-    """Return how many hands gain a hundred times their energy between a tenth of the ticks and the end.
+    """Return for how many hands the motion grows a hundredfold between a tenth of the ticks and the end.
 
     Periods are drawn anew after `mean` ticks on average. If `mean` is None, each tick has the period that gives the
     hand most energy.
@@ -170,7 +170,7 @@ def grown(damping, mean, seed=7):
     "mean",
     [pytest.param(50, marks=pytest.mark.slow), *(pytest.param(n, marks=pytest.mark.validate) for n in (1000, None))],
 )
-def test_hands_gain_energy_only_below_longest_periods_requirement(mean):
+def test_motions_grow_only_below_the_longest_periods_requirement(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)
     assert grown(1.01 * 1.6 * need, mean) == 0
