@@ -381,9 +381,10 @@ class Condition(ABC):
         return loop.environment.here if held == HERE else held
 
 
-def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
-    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` has the block's poles."""
-    available = tuple(delta)
+def _least_damping(
+    name: str, system: Lti, demand: Callable[[], Demand[Lti]], available: tuple[float, ...]
+) -> Requirement:
+    """Return the damping that a demand requires, of `available` [N s/m]; `system` has the block's poles."""
     if reason := unsound(system, available):
         return refusal(name, available, reason)
     try:
@@ -425,7 +426,6 @@ def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> 
 
 def this_environment(F: Lti, loop: Loop) -> Requirement:
     """Return the damping that this-environment requires for the force map F; the loop's environment is not used."""
-    _dampings(loop.delta, F.inputs)
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
@@ -472,7 +472,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 
     With phi (m,) [N s/m] (see `any_environment_demand`) the environment is that of the loop, with its delay psi.
     """
-    available = _dampings(loop.delta, V.inputs)
+    available = loop.delta
 
     def refused(reason: str) -> Requirement:
         return refusal("any-environment", available, reason)
@@ -528,14 +528,6 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
     required = tuple(r.required[0] for r in each)
     available = tuple(r.available[0] for r in each)
     return Requirement("any-environment", required, available, worst.frequency_hz, worst.reason)
-
-
-def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
-    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count."""
-    values = tuple(float(d) for d in delta)
-    if len(values) != channels:
-        raise ValueError(f"delta has {len(values)} entries for {channels} channels")
-    return values
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends

@@ -62,7 +62,7 @@ from haptic_loop.design.frequency import (
     peaks,
     supremum,
 )
-from haptic_loop.design.lmi import RESERVE, Ports, balanced, lemma1, packed, symmetric_from, unit_environment
+from haptic_loop.design.lmi import RESERVE, unit_environment
 from haptic_loop.design.result import (
     ANY,
     HERE,
@@ -553,56 +553,30 @@ def least_phi(loop: Loop) -> Array | None:
     return phi
 
 
-_MOST_STATES = 30  # most states of E-hat for which a storage matrix is searched: 42 take ten seconds, 400 take 20 GB
-
-
 def least_multiplier(loop: Loop) -> Array:
     """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Up to
-    _MOST_STATES states the sum of Phi_i/delta_i is least among such Phi. Raises Infeasible, with the damping that would
-    be needed, if no such Phi exists, diagonal or not, and DesignFailed if no diagonal Phi is found.
+    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling, and its
+    sum of Phi_i/delta_i is the least below this level. Raises Infeasible, with the damping that would be needed, if no
+    such Phi exists, diagonal or not, and DesignFailed if no diagonal Phi is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
     none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
-    least, _ = uncovered(unit, loop.psi, none)  # Phi = least * delta suffices; no smaller multiple does.
-    each, root = least, np.linalg.inv(np.linalg.cholesky(level))
-    if loop.levels:
-        least, _ = uncovered(root @ unit @ root.T, loop.psi, none)
+    root = np.linalg.inv(np.linalg.cholesky(level))
+    least, _ = uncovered(root @ unit @ root.T, loop.psi, none)  # the least multiple of `level` that suffices
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     # The Phi of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
     # halfway between its least possible value and Delta_D.
-    most = (1 + least) / 2 * level
-    if regular.order <= _MOST_STATES:
-        return np.maximum(_of_least_trace(balanced(regular), most, bool(loop.levels)), 0.0) * delta
-    if loop.levels and each >= np.linalg.eigvalsh(most)[0]:
-        return _of_least_trace_at_frequencies(regular, most) * delta
-    return max(each, 0.0) * delta
-
-
-def _of_least_trace(regular: Lti, most: Array, positive: bool) -> Array:
-    """Return the diagonal Phi <= most of least trace, (m,), with `regular` + Phi passive, and >= 0 if `positive`."""
-    m, n = regular.inputs, regular.order
-    ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
-
-    def passive(x: Array) -> Array:
-        return lemma1(ports, symmetric_from(x[m:], n), zero, -np.diag(x[:m]))
-
-    size = range(m + packed(n))
-    storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: most - np.diag(x[:m])
-    blocks = [Inequality.of(passive, size), storage, Inequality.of(room, size)]
-    if positive:
-        blocks.append(Inequality.least(range(m), 0.0))
-    return ConeProgram(np.repeat([1.0, 0.0], [m, packed(n)]), blocks).solve(_PROBLEM)[:m]
+    return _of_least_trace(regular, (1 + least) / 2 * level) * delta
 
 
 _PROBLEM = "the multiplier Phi of the environment"
 
 
-def _of_least_trace_at_frequencies(regular: Lti, most: Array) -> Array:
+def _of_least_trace(regular: Lti, most: Array) -> Array:
     """Return the entries, >= 0, of a diagonal Phi <= most (m, m) with small trace, by cutting planes over frequency.
 
     `regular` + Phi is passive by a sweep, and Phi exceeds `most` by at most _ROOM. Raises Infeasible or DesignFailed.

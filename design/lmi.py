@@ -107,24 +107,6 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
     return Lti(E.A, E.B * root, E.T * root[:, None] * E.C, E.T * root[:, None] * E.D * root, 1.0)
 
 
-def balanced(G: Lti) -> Lti:
-    """Return the realisation of a stable G whose Gramians are equal and diagonal, by the square-root method.
-
-    States with a Hankel value below 1e-11 times the largest are dropped, which changes the response by rounding only.
-    """
-    import scipy
-
-    if G.order == 0:
-        return G
-    reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
-    U, hankel, Vt = scipy.linalg.svd(show.T @ reach)
-    keep = hankel > 1e-11 * max(hankel[0], 1e-300)
-    scale = 1 / np.sqrt(hankel[keep])
-    left = (show @ U[:, keep] * scale).T
-    right = reach @ Vt[keep].T * scale
-    return Lti(left @ G.A @ right, left @ G.B, G.C @ right, G.D, G.T)
-
-
 def reachability_scaled(G: Lti) -> Array:
     """Return S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
     import scipy
@@ -139,15 +121,6 @@ def reachability_scaled(G: Lti) -> Array:
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
     return scipy.linalg.cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
-
-
-def _root(A: Array, B: Array) -> Array:
-    """Return R with R R' = the Gramian of (A, B), also for singular Gramians."""
-    import scipy
-
-    W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
-    values, basis = np.linalg.eigh((W + W.T) / 2)
-    return basis * np.sqrt(np.maximum(values, 0.0))
 
 
 _Matrix = Any  # Array or cvxpy expression, (rows, columns)

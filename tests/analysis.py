@@ -8,18 +8,36 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
+import scipy
 
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Block
 from haptic_loop.controller.lti import Array, Lti, taps
-from haptic_loop.design.conditions import _dampings, _regular_part
-from haptic_loop.design.lmi import (
-    Ports,
-    balanced,
-    lemma1,
-    symmetric,
-    unit_environment,
-)
+from haptic_loop.design.conditions import _regular_part
+from haptic_loop.design.lmi import Ports, lemma1, symmetric, unit_environment
+
+
+def balanced(G: Lti) -> Lti:
+    """Return the realisation of a stable G whose Gramians are equal and diagonal, by the square-root method.
+
+    States with a Hankel value below 1e-11 times the largest are dropped, which changes the response by rounding only.
+    """
+    if G.order == 0:
+        return G
+    reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
+    U, hankel, Vt = scipy.linalg.svd(show.T @ reach)
+    keep = hankel > 1e-11 * max(hankel[0], 1e-300)
+    scale = 1 / np.sqrt(hankel[keep])
+    left = (show @ U[:, keep] * scale).T
+    right = reach @ Vt[keep].T * scale
+    return Lti(left @ G.A @ right, left @ G.B, G.C @ right, G.D, G.T)
+
+
+def _root(A: Array, B: Array) -> Array:
+    """Return R with R R' = the Gramian of (A, B), also for singular Gramians."""
+    W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
+    values, basis = np.linalg.eigh((W + W.T) / 2)
+    return basis * np.sqrt(np.maximum(values, 0.0))
 
 
 def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
@@ -80,7 +98,6 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
     Delta_V + s >= 0; the margin is -s.
     """
     Block.of(environment)
-    delta = _dampings(delta, environment.inputs)
     if not V.is_stable():
         return Analysis(-np.inf, reason="the coupling V has a pole on or outside the unit circle")
     V1 = V.dc()

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from analysis import analysis, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
+from analysis import analysis, balanced, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
 from evaluate import any_environment
 from shared import DELTA, FIGURE_4, T
 
@@ -13,14 +13,7 @@ from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.conditions import _v_hat
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
-from haptic_loop.design.lmi import (
-    Ports,
-    balanced,
-    lemma1,
-    lemma2,
-    lemma3,
-    unit_environment,
-)
+from haptic_loop.design.lmi import Ports, lemma1, lemma2, lemma3, unit_environment
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 
