@@ -2,9 +2,9 @@
 
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|imports|long|peers ..]
 
-`cold` measures commands until they end, and `first` until they print a line. Both give wall seconds and need an idle
-machine; all other times are CPU seconds. `long` measures commands of many seconds, and `imports` the imports of the
-commands of `cold` (`python -X importtime`). Ratios are medians of rounds in which the compared programs alternate.
+`cold` measures commands until they end, `first` until they print a line, and `imports` the imports of the commands of
+`cold` (`python -X importtime`). These three give wall seconds and need an idle machine; the others give CPU seconds.
+`long` measures commands of many seconds. Ratios are medians of rounds in which the compared programs alternate.
 Commands alternate with the floor, a process that only imports NumPy and MuJoCo. Goals are multiples of the floor's
 time. `--write` puts the table of cold into docs/accuracy.md.
 """

@@ -173,7 +173,7 @@ def test_facts_and_conditions_need_one_method_each():
 
 
 def test_an_own_fact_matches_a_dense_sweep(repeats):
-    """The ratio s is the least with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid. No other a has less."""
+    """The ratio is the least s with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid; 8 other a give no less."""
     own = repeats["RepeatedForces"]()
     requirement = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
