@@ -69,10 +69,9 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
-        limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
-        with options.refused():
-            audited = audit(loop, coupling, condition, args.seed, limits, move)
+    what = "searching the ranges" if loop.ranges else "proving the conditions"
+    with render.progress(what) as move, options.refused():
+        audited = audit(loop, coupling, condition, args.seed, move)
     if not args.rigid:  # The loop before a rigid wall is judged without the scenario's encoder steps and lost packets.
         audited = replace(audited, assessment=qualified(scenario, args.case, audited.assessment))
     notes = ()

@@ -167,7 +167,7 @@ def _print_certificate(
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the measured delay, and reserves for longer delays"
     console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
-    remarks = [(program.assessment.force_limits.within(caps).words, *program.remarks()) for program in programs]
+    remarks = [(program.assessment.within(caps).force_limits.words, *program.remarks()) for program in programs]
     shared = set(remarks[0]).intersection(*remarks) if len(programs) > 1 else set()
     for program, own in zip(programs, remarks, strict=True):
         for remark in (each for each in own if each not in shared):

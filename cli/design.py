@@ -172,7 +172,6 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             design,
             ranges_seed=args.seed,
             limiter=args.limiter,
-            force_limit=tuple(device.force_limit for device in scenario.axis_devices),
             band_hz=args.band_hz or BAND_HZ,
             progress=move,
         )

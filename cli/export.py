@@ -25,7 +25,6 @@ from haptic_loop.design.export import (
     coupling_block,
     in_single_precision,
     process_block,
-    single_precision_error,
     trial,
     with_origin,
 )
@@ -98,7 +97,7 @@ def main(argv: list[str]) -> int:
         block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
         forces if args.process else None,
-        _error(block) if args.float else None,
+        _error(block),
         {"ticks": len(test.inputs), "largest_output": np.abs(test.outputs).max()},
         claim,
     )
@@ -156,8 +155,10 @@ def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ..
     return loop.per_channel(given * len(loop.devices) if len(given) == 1 else given), vectors
 
 
-def _error(block: ExportedBlock) -> str:
-    error, largest = single_precision_error(block)
+def _error(block: ExportedBlock) -> str | None:
+    if block.single is None:
+        return None
+    error, largest = block.single
     unit = "N" if block.output.letter == "f" else "m"
     return (
         f"differs from double precision by at most {error:.2g} {unit} in 4096 random ticks; "

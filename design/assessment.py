@@ -9,7 +9,7 @@ run. If one of them changes, `assess` must be called again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,7 +49,6 @@ from haptic_loop.design.environments import (
     in_each,
     worst,
 )
-from haptic_loop.design.files import InputError
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice, described
 from haptic_loop.design.result import (
     ANY,
@@ -232,7 +231,7 @@ class ForceLimits:
         requirement: The requirement of the condition `limiter`, if it was evaluated.
         c: The multiplier of the condition `limiter`, one row per device, no unit.
         certificate: The proof of the condition `limiter`, or None.
-        force_limit: (m,) largest forces [N].
+        force_limit: (m,) largest forces [N] for reports, or (); `Assessment.within` sets them.
         less: Whether the limiter is covered in one environment only, while the guarantee covers more environments.
         bounded: Whether the limiter is covered only for devices within the bounds of the condition known-device.
         energy_budget: The start W0 [J] of an energy account of the forces; None without one.
@@ -251,10 +250,6 @@ class ForceLimits:
     energy_budget: float | None = None
     void: bool = False
     proof: str = "sampled"
-
-    def within(self, force_limit: Sequence[float]) -> ForceLimits:
-        """Return the record with other force limits (m,) [N]; no proof depends on them."""
-        return replace(self, force_limit=tuple(force_limit))
 
     @property
     def words(self) -> str:
@@ -308,10 +303,10 @@ def _covered_limits(
     if not extended:
         return ForceLimits(None, "no certified condition that extends to limited forces")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
-    candidates = [_by_its_own_block(loop, coupling, proof, known, extended[0], c)]
-    if candidates[0].rho is None and len(extended) > 1:
-        candidates.insert(0, _by_its_own_block(loop, coupling, None, known, extended[1]))
-    covered = next((each for each in candidates if each.rho is not None), candidates[-1])
+    covered = _by_its_own_block(loop, coupling, proof, known, extended[0], c)
+    if covered.rho is None and len(extended) > 1:
+        second = _by_its_own_block(loop, coupling, None, known, extended[1])
+        covered = second if second.rho is not None else covered
     return replace(covered, less=less)
 
 
@@ -584,6 +579,10 @@ class Assessment:
         """The remark that proofs neglect the change of pose while motors hold torques; None for devices of one axis."""
         return held_torques(self.loop)
 
+    def within(self, force_limit: Sequence[float]) -> Assessment:
+        """Return the assessment with force limits (m,) [N] for its words; no proof depends on them."""
+        return replace(self, force_limits=replace(self.force_limits, force_limit=tuple(force_limit)))
+
     def without_guarantee(self, reason: str) -> Assessment:
         """Return the assessment without its guarantee, for this reason, and with its limiter marked as void."""
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
@@ -621,7 +620,6 @@ def assess(
     ranges_seed: int = 0,
     ranges_samples: int = _SAMPLES,
     limiter: bool | None = None,
-    force_limit: Sequence[float] = (),
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
 ) -> Assessment:
@@ -644,7 +642,6 @@ def assess(
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
         limiter: False to clip forces even if a condition covers a limiter.
-        force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
         progress: Called with (done, total) of the conditions, and then of the points of a search over ranges.
 
@@ -666,7 +663,6 @@ def assess(
     if certificate is not None:
         of_kind("certificate", certificate, Certificate, "a Certificate, as prove(loop, coupling, condition) gives it")
     ranges_seed, ranges_samples = whole("ranges_seed", ranges_seed, 0), whole("ranges_samples", ranges_samples, 0)
-    force_limit = _checked_limits(force_limit, loop.channels)
     in_band(band_hz, loop.T)
     searched = limiter_proof = limiter_c = None
     if isinstance(coupling, Chosen):
@@ -712,7 +708,7 @@ def assess(
         requirements,
         network if environment is None else environment,
         ranges,
-        limits.within(force_limit),
+        limits,
         _transparency(here, coupling, band_hz),
         known or (ranges and ranges.certificate),
         None,
@@ -757,16 +753,6 @@ def _guaranteed(assessment: Assessment) -> Assessment:
     if guarantee is None:
         return assessment.without_guarantee(str(reason))
     return replace(assessment, guarantee=guarantee)
-
-
-def _checked_limits(force_limit: Sequence[float], channels: int) -> tuple[float, ...]:
-    """Return limits (m,) [N], or () for none. Raises TypeError or InputError for other values."""
-    expected = f"a positive force in N for each of {channels} channels, or ()"
-    of_kind("force_limit", force_limit, Iterable, expected)
-    limits = tuple(number("force_limit", limit, expected) for limit in force_limit)
-    if len(limits) not in (0, channels) or not all(limit > 0 for limit in limits):
-        raise InputError(f"force_limit is {list(limits)}, expected {expected}")
-    return limits
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:

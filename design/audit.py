@@ -348,7 +348,6 @@ def audit(
     coupling: Coupling,
     condition: Condition | None = None,
     seed: int = 0,
-    force_limit: Sequence[float] = (),
     progress: Progress = lambda done, total: None,
 ) -> Audit:
     """Assess a coupling, with its margins to the edge of each condition.
@@ -358,7 +357,6 @@ def audit(
         coupling: The coupling to audit.
         condition: The condition that must hold; None for this-environment, or known-device for known devices.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
-        force_limit: (m,) force limits [N], for the report.
         progress: Called with (points done, number of points) of the search over ranges.
 
     Raises:
@@ -369,7 +367,7 @@ def audit(
     constant = loop.at(loop.environment).switching(None)
     conditions = {each.name: each for each in (*conditions_of(loop), wanted)}
     searched = Forked(_searched, constant, coupling, conditions, wanted.name, not loop.varying_delay)
-    assessment = assess(loop, coupling, condition=wanted, ranges_seed=seed, force_limit=force_limit, progress=progress)
+    assessment = assess(loop, coupling, condition=wanted, ranges_seed=seed, progress=progress)
     needs, switching = assessment.requirements, None
     if loop.varying_delay:
         from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start faster without it.

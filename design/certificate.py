@@ -63,11 +63,11 @@ def _in_time() -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The proof shows that a demand's static matrices are symmetric, and positive semidefinite where required, and that
-# each block of the condition at the available damping is strictly positive real (design.exact). This implies that F, or
-# V-hat, is stable. For any-environment with psi = 0, Phi = 0 satisfies Lemma 4, because the environment is passive.
-# With ranges, a condition that uses the environment is proved for the nominal environment (matrix P) and for at most
-# 128 vertices (P1, P2, ..). Environments between the vertices, or environments that change with time, have no proof.
+# A proof shows that the static matrices of a demand are symmetric, and positive semidefinite where required. It also
+# shows that each block of the condition at the available damping is strictly positive real (design.exact). This implies
+# that the force map F (6), or V-hat (11), is stable. For any-environment with psi = 0, Phi = 0 satisfies Lemma 4,
+# because the environment is passive. With ranges, a condition that uses the environment is proved for the nominal
+# environment (matrix P) and for at most 128 vertices (P1, P2, ..). Environments between the vertices have no proof.
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def prove(
 
     Args:
         loop: The loop. Its facts, such as walls or delays that switch, are part of the condition.
-        condition: A name or a condition. design.environments.LimitedForces covers limited forces, too; under
-            any-environment without delay in the environment the limiter has rho = 0 and needs no further proof.
+        condition: A name or a condition. LimitedForces (design.environments) covers limited forces, too. With psi = 0,
+            any-environment covers them without a further proof, by a limiter with rho = 0.
         multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None to search for them.
         swept: The result of `required_damping` for these arguments, if the caller has it.
 
@@ -123,7 +123,7 @@ def prove(
     return certificate
 
 
-_FORKED = 40  # least number of states of a block whose proof takes longer than the start of a second process
+_FORKED = 40  # The proof of a block with more states takes longer than the start of a second process.
 _made: set[str] = set()  # seals of certificates that this process has proved or verified for the package's conditions
 
 
@@ -137,7 +137,7 @@ def _proof(
     """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
-    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep may omit them.
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep may omit multipliers.
     requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)
@@ -151,7 +151,7 @@ def _proof(
         raise NotProved(reason, requirement)
     try:
         return requirement, _matrices(condition, loop, requirement, blocks)
-    finally:  # A system that rounding changes is the first reason to name.
+    finally:  # If rounding changes the system, this is the reason to report, whatever else fails.
         if system and (reason := system.result()):
             raise NotProved(reason, requirement)
 
@@ -173,17 +173,14 @@ def _placed(place: str, reason: str) -> str:
     return f"{place}{reason.removeprefix(place)}"
 
 
-def judged(
-    loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
-) -> Requirement:
+def judged(loop: Loop, coupling: Coupling, condition: Condition) -> Requirement:
     """Return the requirement of a condition; its `proof` is "rational" if it is proved exactly."""
-    resolved, coupling = named(condition), filed(loop, coupling)
-    needs = required_damping(loop, coupling, resolved, multiplier)
-    return _with_proof(loop, coupling, resolved, needs)
+    coupling = filed(loop, coupling)
+    return _with_proof(loop, coupling, condition, condition.judge(loop, coupling))
 
 
 def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
-    """Return the requirement with the result of an exact proof: `proof` = "rational", or infinite if refuted."""
+    """Return the requirement, with `proof` = "rational" if it is proved exactly, or infinite if it is refuted."""
     if not needs.certified:
         return needs
     try:
@@ -324,10 +321,10 @@ def condition_of(certificate: Certificate, condition: Condition | None = None) -
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
-    """Check the stored certificate's digest, seal and figures, and repeat the exact proof with its matrices.
+    """Return whether the stored certificate's digest, seal and figures are right and its matrices are an exact proof.
 
-    For a certificate of a user's own condition, `condition` must be that condition. Its block is proved again, but that
-    the block keeps the loop safe is the claim of its author.
+    For a certificate of a user's own condition, `condition` must be that condition. The block is proved again. That the
+    block keeps the loop safe is the claim of the condition's author.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -367,9 +364,9 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
 def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
     """Return the requirement of a certificate's condition and multipliers in this loop, proved with its matrices.
 
-    `known` is a certificate that this process has proved or verified; if it is `certificate` and belongs to this loop
-    and coupling, the exact proof is not repeated. Raises NotProved if the certificate does not hold in the loop, or if
-    the proof would take minutes.
+    `known` is a certificate that this process has proved or verified. If `known` is `certificate` and belongs to this
+    loop and coupling, the exact proof is not repeated. Raises NotProved if the certificate does not hold in the loop,
+    or if the proof would take minutes.
     """
     is_proved = known is certificate and certificate.scenario == digest(loop, coupling.form())
     try:
@@ -520,21 +517,21 @@ def requirements_of(
     """Return the requirement of each condition of the package, and of the user's `own` condition if there is one.
 
     Each condition is proved exactly if possible. `known` is a certificate that holds; its proof is not repeated. A loop
-    without bounds of its devices gets no known-device conditions. The environment is the nominal one and the delays
-    theta are constant; design.assessment adds ranges and switching. `progress` is called with the number of finished
-    proofs and the number of conditions.
+    without bounds of its devices gets no known-device conditions. The environment is nominal and the delays theta are
+    constant; design.assessment adds ranges and switching. `progress` is called with the number of finished proofs and
+    the number of conditions.
     """
     loop = loop.at(loop.environment).switching(None)
     conditions = (*conditions_of(loop), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    pairs = [(each, each.judge(loop, coupling)) for each in conditions]
-
-    def judged(i: int, each: Condition, needs: Requirement) -> Requirement:
-        progress(i, len(pairs))
-        if each.name == proved:
-            return replace(needs, proof="rational")
-        return _with_proof(loop, filed(loop, coupling), each, needs)
-
+    requirements = {each.name: each.judge(loop, coupling) for each in conditions}
     with within(budgets.EXACT):  # one budget for all proofs
-        return {each.name: judged(i, each, needs) for i, (each, needs) in enumerate(pairs)}
+        for i, each in enumerate(conditions):
+            progress(i, len(conditions))
+            needs = requirements[each.name]
+            if each.name == proved:
+                requirements[each.name] = replace(needs, proof="rational")
+            else:
+                requirements[each.name] = _with_proof(loop, filed(loop, coupling), each, needs)
+    return requirements

@@ -52,7 +52,8 @@ class Matrix:
         return np.vectorize(lambda v: v / self.den, otypes=[np.float64])(self.num)
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and of each bit of the two integers
+#: work [units of `spend`] of a product of two integers, and what each bit of the two integers adds
+_LIMBS, _BIT = 5e-9, 3e-11
 
 
 #: Matrix products with at most this many multiplications of integers (about 21 states) are computed without FLINT,
@@ -110,7 +111,7 @@ _GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes t
 
 
 def _halves(S: Matrix) -> list[int]:
-    """Return exponents of two; S with rows and columns divided by these powers has a diagonal near one."""
+    """Return an exponent of two per row. Rows and columns divided by these powers give S a diagonal near one."""
     return [(int(v).bit_length() - S.den.bit_length()) // 2 for v in np.diag(S.num)]
 
 
@@ -125,11 +126,13 @@ def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
 
 
 def _nearest(num: int, den: int, shift: int) -> int:
+    """Return 2^shift num/den, rounded to the nearest integer."""
     num, den = (num << shift, den) if shift >= 0 else (num, den << -shift)
     return (2 * num + den) // (2 * den)
 
 
 def _less(W: _Integers, units: int) -> _Integers:
+    """Return W with `units` subtracted from its diagonal."""
     W = W.copy()
     W[np.diag_indices(len(W))] -= units
     return W
@@ -138,9 +141,9 @@ def _less(W: _Integers, units: int) -> _Integers:
 def _definite(W: _Integers, bits: int) -> bool:
     """Return whether the symmetric integer matrix W (n, n), in units of 2^-bits, is proved to be positive definite.
 
-    Between passes all entries lose the same number of low bits, so that the largest keeps 32 more than `bits`. Each
-    entry then changes by less than one unit, and the norm of the matrix by less than n units, which are subtracted from
-    the diagonal.
+    Between two passes all entries lose the same number of low bits, so that the largest entry keeps `bits` + 32 bits.
+    Each entry then changes by less than one unit, and the norm of the matrix by less than n units. These n units are
+    subtracted from the diagonal.
     """
     for _ in range(budgets.DEFINITE_PASSES):
         floats = _floats(W)
@@ -159,10 +162,11 @@ def _longest(W: _Integers) -> int:
 
 
 def _dominates(W: Array) -> bool:
-    """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
+    """Return whether every diagonal entry exceeds the sum of the absolute values of the other entries in its row.
 
-    The answer holds for the integers from which `_floats` made W. Rounding changed each by at most 2^-53 of itself plus
-    2^-900 of the largest, and changes a sum of n < 2^11 terms by at most the share n 2^-53. The test allows for more.
+    The answer holds for the integers from which `_floats` made W. Rounding changed each integer by at most 2^-53 of
+    itself plus 2^-900 of the largest. Rounding changes a sum of n < 2^11 terms by at most the share n 2^-53. The test
+    allows for larger changes.
     """
     diagonal = np.diag(W)
     others = np.abs(W).sum(axis=1) - np.abs(diagonal)
@@ -181,7 +185,7 @@ def _whitening(W: Array) -> _Integers | None:
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
-    # Row and column i are multiplied by 2^half[i], so that all entries of the diagonal have about the same size.
+    # Row i and column i are multiplied by 2^half[i], so that all entries of the diagonal have about the same size.
     half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2
     with np.errstate(over="ignore"):
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
@@ -203,17 +207,17 @@ def _whitening(W: Array) -> _Integers | None:
 # Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, and exact arithmetic tests P. By the
 # Kalman-Yakubovich-Popov lemma (docs/theory.md) G is strictly positive real if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
-# P may be rounded, because any P that satisfies both inequalities is a proof. The errors of all other rounding are
-# bounded and subtracted.
+# P may be rounded, because any P that satisfies both inequalities is a proof. The errors of all other roundings are
+# bounded, and the bounds are subtracted from the diagonal.
 
 
 _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; the package stores a few hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
-_EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision on x86 has 64
-_LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative to the largest, are raised to this
+_EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; x86's extended precision has 64 bits
+_LEAST_MOVED = 1e-10  # least eigenvalue of a normalised covariance, relative to the largest; smaller ones are raised
 _LEFT = 0.02  # Newton's steps end if the residual of the Riccati equation is below this share of e (`find_storage`)
 _UNIT = 2.0**-53  # unit roundoff of double precision
-_ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
+_ACCURACIES = (48, 112), (192, 192)  # for each attempt of a proof: binary digits of P, and of A, B, C and D
 _MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of `_kyp_matrix` is below this many units u.
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
@@ -222,11 +226,11 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     """Return the matrix of (KYP) in units of u = 2^-finer, and a bound on the norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
-    multiples of 2^-bits; the rounded P is exactly known and may itself be a proof. The other matrices are rounded to
-    multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded down to
-    multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm. The error by E is
-    |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point computes to at least two
-    digits.
+    multiples of 2^-bits. The rounded P is known exactly and may itself be a proof. The other matrices are rounded to
+    multiples of u, which changes entries of C by u/2, of D + D' by u, and J = [A B] by E with |E_ij| <= u/2. The sum is
+    rounded down to multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm.
+    E adds |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm. The factor 1.02 covers the rounding of
+    this bound in floating point.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
@@ -303,7 +307,7 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
 
 
 def reached(G: Lti) -> Lti:
-    """Return the same map without the states that no input reaches, which stay zero, by the pattern of A and B."""
+    """Return the same map without the states that stay zero because, by the pattern of A and B, no input moves them."""
     reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
     while (more := reached_states | (pattern & reached_states).any(axis=1)).sum() > reached_states.sum():
@@ -317,7 +321,7 @@ class Violated(str):
     """The reason why a block cannot have a proof: it is negative beyond rounding at some frequency."""
 
 
-_CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because D of the scaled block has ones on its diagonal.
+_CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the scaled block has ones on the diagonal of D.
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
@@ -325,10 +329,12 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation has an
-    added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. The equation is first solved in coordinates in
-    which white noise at the inputs moves all states equally and independently, because P is better conditioned there,
-    then in the original states, and last in the first coordinates with a larger share of mu. The result is transformed
-    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
+    added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. Up to three attempts solve the equation:
+     1. in coordinates in which white noise at the inputs moves all states equally and independently, because P is
+        better conditioned there,
+     2. in the original states,
+     3. in the coordinates of the first attempt, with a larger share of mu.
+    The result is transformed back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -359,8 +365,10 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (a change of coordinates, P in the new ones). If `white`, white noise at the inputs moves the new states
-    equally and independently; else the coordinates stay. Raises LinAlgError."""
+    """Return (a change of coordinates, P in the new coordinates). Raises LinAlgError.
+
+    If `white`, white noise at the inputs moves the new states equally and independently. Otherwise the states stay.
+    """
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
         out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2
@@ -413,7 +421,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 
 
 def _independent(covariance: Array) -> tuple[Array, Array]:
-    """Return the change to coordinates with the covariance I, and its inverse."""
+    """Return the matrix that changes to coordinates with the covariance I, and the inverse of this matrix."""
     variance = np.diag(covariance)
     deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Small variances may be rounding errors.
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
@@ -467,7 +475,7 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
 
 
 def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
-    """Return out' P out with rows and columns divided by powers of two, exact for the rounded `out` and P."""
+    """Return out' P out with row i and column i divided by 2^half[i]. Only `out` and P are rounded."""
 
     def integers(a: Array) -> tuple[_Integers, int]:
         power = _EXTENDED_BITS - int(np.frexp(np.abs(a).max())[1])

@@ -78,7 +78,7 @@ class ExportedBlock:
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
     limiter: Limiter | None = None  # None: no limiter. With one, `system` is the block while no force is limited.
-    single: bool = False  # whether the file computes in single precision
+    single: tuple[float, float] | None = None  # single precision: its largest error, and the largest output
 
     @property
     def dtype(self) -> type[np.floating]:
@@ -175,20 +175,15 @@ def trial(block: ExportedBlock) -> _Trial:
     return _Trial(inputs, _sequential(block.system, inputs, block.limiter, block.dtype))
 
 
-def single_precision_error(block: ExportedBlock) -> tuple[float, float]:
-    """Return the largest difference of single from double precision, and the largest output, over _COMPARED ticks."""
+def in_single_precision(block: ExportedBlock) -> ExportedBlock:
+    """Return the block in single precision, with its largest difference from double precision over _COMPARED ticks."""
     rng = np.random.default_rng(0)
     inputs = block.input.size * rng.standard_normal((_COMPARED, block.system.inputs))
     double, single = (_sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
-    return float(np.abs(double - single).max()), float(np.abs(double).max())
-
-
-def in_single_precision(block: ExportedBlock) -> ExportedBlock:
-    """Return the block in single precision, with a comment line on its error."""
-    error, largest = single_precision_error(block)
+    error, largest = float(np.abs(double - single).max()), float(np.abs(double).max())
     line = f"Single precision: {_COMPARED} ticks differ from double precision by at most {error:.2g} where the largest "
     line += f"{block.output.what} is {largest:.3g}. No proof covers this rounding."
-    return replace(block, single=True, about=(*block.about, line))
+    return replace(block, single=(error, largest), about=(*block.about, line))
 
 
 def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
@@ -235,9 +230,9 @@ def _turns(m: int) -> int:
     return min(3**m, _MOST_TURNS)
 
 
-def _rounding(single: bool) -> float:
+def _rounding(dtype: type[np.floating]) -> float:
     """Return the largest rounding error of a residual, relative to the sum of the sizes of its terms."""
-    return float(np.float32(_SINGLE_ROUNDING)) if single else PIVOT_ROUNDING
+    return float(np.float32(_SINGLE_ROUNDING)) if dtype is np.float32 else PIVOT_ROUNDING
 
 
 def _in_order(terms: Any) -> Any:
@@ -262,7 +257,7 @@ def _solved(rows: Array, pivoting: bool) -> Array:
 def _boxed(M: Array, limit: Array, q: Array) -> tuple[Array, Array]:
     """Solve f = q - M e (m,) for (e, f) by the operations of the C file, in their order and in the precision of q."""
     m, real = len(q), q.dtype.type
-    zero, rounding, sign = real(0), real(_rounding(real is np.float32)), np.zeros(m, real)
+    zero, rounding, sign = real(0), real(_rounding(real)), np.zeros(m, real)
     e = f = q
     for _ in range(_turns(m)):
         active = sign != 0
@@ -329,7 +324,7 @@ def _block_of_balls(
 ) -> tuple[Array, Array]:
     """Solve f = q - M e (n,) for (e, f) in a block of limited `vectors`; f is 0 if no solution is found."""
     n, real = len(q), q.dtype.type
-    residual, rounding, eye = real(_RESIDUAL), real(_ball_rounding(real is np.float32)), np.eye(n, dtype=real)
+    residual, rounding, eye = real(_RESIDUAL), real(_ball_rounding(real)), np.eye(n, dtype=real)
     u = back = q
     length, tried, best = np.empty_like(q), False, real(0)
     for _ in range(_MOST_STEPS):
@@ -364,9 +359,9 @@ def _block_of_balls(
     return _solved(np.column_stack([M, q]), pivoting=True), np.zeros_like(q)
 
 
-def _ball_rounding(single: bool) -> float:
+def _ball_rounding(dtype: type[np.floating]) -> float:
     """Return the allowed rounding error of a block's residual, relative to the largest row sum of absolute terms."""
-    return _BALL_ROUNDING * float(np.finfo(np.float32 if single else np.float64).eps)
+    return _BALL_ROUNDING * float(np.finfo(dtype).eps)
 
 
 def _delays(loop: Loop, with_theta: bool) -> str:
@@ -767,14 +762,17 @@ def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) 
         words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
         words |= {
             "residual": _RESIDUAL.hex() + words["f"],
-            "rounding": _ball_rounding(block.single).hex() + words["f"],
+            "rounding": _ball_rounding(dtype).hex() + words["f"],
         }
         words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
         words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
         words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
     else:
         tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
-        words |= {"turns": str(_turns(block.system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
+        words |= {
+            "turns": str(_turns(block.system.inputs)),
+            "rounding": _rounding(dtype).hex() + words["f"],
+        }
         reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
         words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
     for of, rows in {**tables, "KICK": limiter.kick}.items():

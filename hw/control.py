@@ -534,7 +534,7 @@ class CertifiedCoupling:
 
     def capped(self, cap: Sequence[float]) -> Assessment:
         """Return the assessment with the force cap (m,) [N] of a session; no proof depends on this cap."""
-        return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
+        return self.assessment.within(cap)
 
     def remarks(self) -> list[str]:
         """Return remarks on the file, the user's conditions, held torques, walls, latency and missed answers."""

@@ -236,7 +236,6 @@ def assessed(
         energy_budget=energy_budget,
         ranges_seed=seed,
         limiter=limiter,
-        force_limit=tuple(device.force_limit for device in scenario.axis_devices),
         band_hz=band_hz,
         progress=progress,
     )
@@ -244,12 +243,13 @@ def assessed(
 
 
 def qualified(scenario: Scenario, case: str, assessment: Assessment) -> Assessment:
-    """Add the scenario's encoder steps to an assessment, and remove a guarantee that does not cover the scenario.
+    """Return the assessment with the scenario's force limits and encoder steps.
 
-    A shell gives no guarantee with encoder steps. With lost packets only an energy budget gives a guarantee, because
-    forces may become older than any certificate covers.
+    A guarantee that does not cover the scenario is removed. A shell gives no guarantee with encoder steps. With lost
+    packets only an energy budget gives a guarantee, because forces may become older than any certificate covers.
     """
     plugged = shelled(assessment.environment)
+    assessment = assessment.within([device.force_limit for device in scenario.axis_devices])
     assessment = assessment.with_encoder(None if plugged else encoder_steps(scenario, case, assessment))
     if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.axis_devices):
         return assessment.without_guarantee("the devices have encoder steps, and the shell requires exact positions")

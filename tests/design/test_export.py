@@ -30,8 +30,8 @@ from haptic_loop.design.export import (
     _Balls,
     _sequential,
     c_source,
+    in_single_precision,
     process_block,
-    single_precision_error,
     trial,
 )
 from haptic_loop.design.files import InputError, one_command
@@ -190,7 +190,7 @@ def test_limited_force_vectors_are_those_of_the_simulator(space, psi):
 @needs_cc
 @pytest.mark.parametrize(("psi", "single"), checkered(((0, 0, 0, 0), (1, 1, 0, 0)), (False, True)))
 def test_limited_vectors_in_c_repeat_their_test_vector(space, tmp_path, psi, single):
-    block = replace(vectors(space[0], psi), single=single)
+    block = replace(vectors(space[0], psi), single=(0.0, 0.0) if single else None)
     out = tmp_path / "process.c"
     out.write_text(c_source(block, trial(block), out.name))
     process = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
@@ -309,7 +309,7 @@ def test_single_precision_stays_within_its_error_bound(data):
 
 
 def test_single_precision_errs_little_over_many_ticks():
-    error, largest = single_precision_error(process_block(Stored.of(PAIR, SOFT)))
+    error, largest = in_single_precision(process_block(Stored.of(PAIR, SOFT))).single
     assert 0 < error < 1e-4 * largest
 
 

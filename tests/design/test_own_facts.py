@@ -193,7 +193,7 @@ class Anything(Nothing):
 def test_the_first_line_names_an_own_condition():
     """any-environment certifies SOFT, but it leaves out the fact, so that it gives neither guarantee nor limiter."""
     for own, coupling in ((Twenty(), SOFT), (Nothing(), STIFF)):
-        assessment = assess(PAIR, coupling, condition=own, force_limit=(12.0, 12.0))
+        assessment = assess(PAIR, coupling, condition=own).within((12.0, 12.0))
         stated = assessment.guarantee
         assert stated
         assert (stated.condition, stated.environments, stated.forces) == (own.name, HERE, BELOW_LIMITS)
@@ -257,7 +257,7 @@ def test_certify_refuses_switching_for_an_own_condition():
 )
 def test_an_own_limiter_counts_once_it_is_proved(loop, base, shipped):
     own = condition(base, Less(0.0))
-    assessment = assess(loop, SOFT, condition=own, force_limit=(12.0, 12.0))
+    assessment = assess(loop, SOFT, condition=own).within((12.0, 12.0))
     assert assessment.force_limits.rho == LIMITER.rho(loop)
     assert assessment.force_limits.proved
     assert assessment.decisive.ratio == pytest.approx(required_damping(loop, SOFT, shipped).ratio, rel=1e-6)
