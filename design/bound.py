@@ -22,7 +22,6 @@ subtracted from the proved bound, and _QUADRATURE from both.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,7 +74,6 @@ class Bound:
     rms: float  # relative to the environment
     proved: bool  # whether D >= 0 is proved on the whole circle; True for a bound of 0, which needs no proof
     sampled_rms: float  # the estimate from samples alone
-    seconds: float
 
     @property
     def rms_db(self) -> float:
@@ -89,7 +87,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     T_max are replaced by even periods with less damping. With a latency of at least t1, Delta T/(T_max - t1) is the
     damping (docs/theory.md).
     """
-    started, level = time.perf_counter(), even_level(loop)
+    level = even_level(loop)
     if loop.latency:
         longest, first = loop.T_max or loop.T, np.array([least for least, _ in loop.latency])
         level = level * (longest / (longest - first))[:, None]
@@ -99,7 +97,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     sampled, charged = (float(np.sqrt(max(square - _QUADRATURE, 0.0))) for square in dual.best())
     proved = charged > 0 or sampled == 0  # A bound of zero needs no proof.
-    return Bound(charged if proved else sampled, proved, sampled, time.perf_counter() - started)
+    return Bound(charged if proved else sampled, proved, sampled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +131,10 @@ class _Dual:
         w, weight, part = _gauss(grid)
         weight = weight / (w * span)
         H = np.concatenate([(1 - f) * heights[:-1] + f * heights[1:] for f in part])
-        size, target = _late(loop, E, w)
+        z = on_circle(w)
+        response = E.at(z)
+        size = np.linalg.norm(response, axis=(1, 2))
+        target = (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
         target = np.sqrt(weight)[:, None] * target.reshape(w.size, -1)
         Q, R = np.linalg.qr((np.sqrt(weight) * span * w * size / np.pi)[:, None] * H)
         target = -np.vstack([Q.T @ target.real, Q.T @ target.imag])
@@ -346,14 +347,6 @@ def _gauss(grid: Array) -> tuple[Array, Array, Array]:
     return (grid[:-1] + part[:, None] * width).ravel(), (weight[:, None] / 2 * width).ravel(), part
 
 
-def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
-    """Return |E| (k,) and Lambda E/|E| (k, m, m)."""
-    z = on_circle(w)
-    response = E.at(z)
-    size = np.linalg.norm(response, axis=(1, 2))
-    return size, (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
-
-
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
     """Return a point near x, on the line to `inner`, at which no least eigenvalue is negative, or None.
 
@@ -408,28 +401,25 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
                 weights = np.zeros((theta + span + 1, m))
                 weights[k] = unit
                 rows.append((i, weights))
-    if not span:
-        return _first(rows), True
-    G = delay(loop.psi, loop.T) @ E
-    impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
-    reach = np.zeros((span * m, span * m))  # map from the coefficients of R's row to the steps of F's row
-    for step in range(span):
-        for k in range(step, span):
-            reach[step * m : (step + 1) * m, k * m : (k + 1) * m] = impulse[k - step]
-    for v in scipy.linalg.null_space(reach, rcond=1e-9).T:
-        for i, theta in enumerate(loop.theta):
-            weights = np.zeros((theta + span + 1, m))
-            for k, row in enumerate(v.reshape(span, m)):  # F_k = 2 (s_{k+1} - s_k)/T, and s_k is zero up to theta
-                weights[theta + k + 1] += row
-                if k:
-                    weights[theta + k] -= row
-            rows.append((i, weights))
-    return _first(rows), not reach.any()
-
-
-def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
-    """Return the sums with the earliest first step, at most BOUND_SUMS of them."""
-    return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[: budgets.BOUND_SUMS])
+    exact = True
+    if span:
+        G = delay(loop.psi, loop.T) @ E
+        impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
+        reach = np.zeros((span * m, span * m))  # map from the coefficients of R's row to the steps of F's row
+        for step in range(span):
+            for k in range(step, span):
+                reach[step * m : (step + 1) * m, k * m : (k + 1) * m] = impulse[k - step]
+        exact = not reach.any()
+        for v in scipy.linalg.null_space(reach, rcond=1e-9).T:
+            for i, theta in enumerate(loop.theta):
+                weights = np.zeros((theta + span + 1, m))
+                for k, row in enumerate(v.reshape(span, m)):  # F_k = 2 (s_{k+1} - s_k)/T, and s_k is zero up to theta
+                    weights[theta + k + 1] += row
+                    if k:
+                        weights[theta + k] -= row
+                rows.append((i, weights))
+    rows.sort(key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))
+    return tuple(rows[: budgets.BOUND_SUMS]), exact
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:

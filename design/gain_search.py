@@ -12,7 +12,6 @@ known devices is not affine in its multiplier; `KnownDeviceLoop` computes it ane
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from haptic_loop.controller.arithmetic import compiled
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Complex, Sampled
+from haptic_loop.controller.lti import Array, Complex, Lti, Sampled
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
 from haptic_loop.design.environments import LIMITER, SWITCHING
@@ -47,13 +46,41 @@ def damper_rate(z: Complex, T: float) -> Complex:
     return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
 
 
-@dataclass(frozen=True, eq=False)
-class _Around:
-    """Responses of the loop for gains at x: G = (I + Psi E V)^-1 Psi E and its derivatives."""
+class _Responses:
+    """Responses of a loop at fixed frequencies for its spring-damper gains (log K, B/delta), cached for the last gains.
 
-    x: Array
-    G: Complex  # (k, m, m)
-    by: Array | Complex  # (2, k, m)  dG/d(log K_i) = by[0, k, i] G[k, :, i] G[k, i, :]; by[1] is for B_i/delta_i
+    Args:
+        delayed: Psi E.
+        w: (k,) frequencies [rad/sample].
+        delta: (m,) unit of B [N s/m].
+    """
+
+    def __init__(self, delayed: Lti, w: Array, delta: Array) -> None:
+        self.z = on_circle(w)
+        self._delayed = Sampled.of(delayed, self.z[None])
+        self._rate = damper_rate(self.z, delayed.T)[:, None] * delta  # derivative of 1/V with respect to B/delta
+        self._last: tuple[Array, Complex, Array | Complex] | None = None
+
+    def around(self, gains: Array) -> tuple[Complex, Array | Complex]:
+        """Return G = (I + Psi E V)^-1 Psi E, (k, m, m), and by (2, k, m).
+
+        The derivatives of G are dG/d(log K_i) = by[0, k, i] G[k, :, i] G[k, i, :], and the same with by[1] for
+        B_i/delta_i.
+        """
+        if self._last is None or not np.array_equal(self._last[0], gains):
+            log_k, b = np.split(gains, 2)
+            K = np.exp(log_k)
+            compliance = 1 / (K + np.maximum(b, 0.0) * self._rate)
+            V = Sampled(self._delayed.z, compliance[None, :, :, None] * np.eye(K.size), self._delayed.T)
+            by = compliance**2 * np.stack([np.broadcast_to(K, self._rate.shape), self._rate])
+            self._last = gains.copy(), self._delayed.feedback(V).G[0], by
+        return self._last[1:]
+
+
+def _theta(loop: Loop, z: Complex) -> Complex:
+    """Return the diagonal of the delays Theta at z (k,), as (k, m, 1)."""
+    one = Sampled(z[None], np.tile(np.eye(loop.channels, dtype=complex), (1, z.size, 1, 1)), loop.T)
+    return np.diagonal(loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]
 
 
 class SampledLoop:
@@ -68,21 +95,18 @@ class SampledLoop:
     bounds = (0.0, 0.0)
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
-        self.loop, self.E = loop, loop.E()
+        self.loop, E = loop, loop.E()
         low, high = in_band(band_hz, loop.T)
         self.delta = even_damping(loop)
         self.root = np.sqrt(loop.T / self.delta)
-        self.band = frequencies(self.E, low=low, high=high, points=80)
-        E = Sampled.of(self.E, on_circle(self.band)[None])
-        one = Sampled(E.z, np.broadcast_to(np.eye(loop.channels, dtype=complex), E.G.shape), E.T)
-        self.late = np.diagonal(loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]  # Theta
-        self.size2 = (np.abs(E.G[0]) ** 2).sum(axis=(1, 2))
-        self.target = delay(loop.lam, loop.T).at(E.z[0]) @ E.G[0]
-        self._known: dict[str, _Around] = {}
-        self._delayed: dict[str, Sampled] = {}
-        self._rate: dict[str, Complex] = {}  # derivative of 1/V with respect to B/delta
-        self._sample("band", self.band)
-        self._impose(frequencies(self.E, low=1e-3, points=80))
+        self.delayed = delay(loop.psi, loop.T) @ E
+        self.band = frequencies(E, low=low, high=high, points=80)
+        self._in_band = _Responses(self.delayed, self.band, self.delta)
+        z = self._in_band.z
+        self.late, there = _theta(loop, z), E.at(z)
+        self.size2 = (np.abs(there) ** 2).sum(axis=(1, 2))
+        self.target = delay(loop.lam, loop.T).at(z) @ there
+        self._impose(frequencies(E, low=1e-3, points=80))
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(self._gains(x), 2)
@@ -117,8 +141,7 @@ class SampledLoop:
     def _impose(self, w: Array) -> None:
         """Sample the loop at w (k,), and the block's entries at G = mu = 0 with their slopes in G, mu and G mu."""
         self.conditions, m = w, self.loop.channels
-        self._sample("conditions", w)
-        self._known.clear()
+        self._imposed = _Responses(self.delayed, w, self.delta)
         self._last: tuple[Array, Array, Complex] | None = None
         both = np.stack([0 * np.eye(m), np.eye(m)]).astype(np.complex128)  # G = 0 and G = I
         response = Sampled(on_circle(w)[None], np.broadcast_to(both[:, None], (2, w.size, m, m)), self.loop.T)
@@ -135,39 +158,21 @@ class SampledLoop:
         of_mu, of_both = entries(1) if self.active.size else (none, of_G)
         self._affine = none, of_G - none, of_mu - none, of_both - of_G - of_mu + none
 
-    def _sample(self, where: str, w: Array) -> None:
-        """Store Psi E at exp(jw), and the slope of 1/V in B/delta."""
-        delayed = Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
-        self._delayed[where] = delayed
-        self._rate[where] = damper_rate(delayed.z[0], delayed.T)[:, None] * self.delta
-
-    def _around(self, x: Array, where: str) -> _Around:
-        """Return the loop at the frequencies of the band or of the condition, cached for the last x."""
-        gains, known = self._gains(x), self._known.get(where)
-        if known is None or not np.array_equal(known.x, gains):
-            delayed, of_b, (log_k, b) = self._delayed[where], self._rate[where], np.split(gains, 2)
-            K = np.exp(log_k)
-            compliance = 1 / (K + np.maximum(b, 0.0) * of_b)
-            V = Sampled(delayed.z, compliance[None, :, :, None] * np.eye(K.size), delayed.T)
-            by = compliance**2 * np.stack([np.broadcast_to(K, of_b.shape), of_b])
-            known = self._known[where] = _Around(gains.copy(), delayed.feedback(V).G[0], by)
-        return known
-
     def square_mismatch(self, x: Array) -> float:
         """Return the logarithm of the mean square mismatch ||M||_F^2/||E||_F^2 over log frequency."""
         log_w = np.log(self.band)
         return float(np.log(self._mean(x) / (log_w[-1] - log_w[0])))
 
     def _mean(self, x: Array) -> float:
-        M = self.late * self._around(x, "band").G - self.target
+        M = self.late * self._in_band.around(self._gains(x))[0] - self.target
         return float(np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, np.log(self.band)))
 
     def square_mismatch_slope(self, x: Array) -> Array:
         """Return the gradient of `square_mismatch`; its entries after those of the gains are 0."""
-        around = self._around(x, "band")
-        F = self.late * around.G
-        back = np.einsum("kij,kji->ki", around.G @ (F - self.target).conj().swapaxes(1, 2), F)
-        moved = 2 * (back * around.by).real / self.size2[:, None]
+        G, by = self._in_band.around(self._gains(x))
+        F = self.late * G
+        back = np.einsum("kij,kji->ki", G @ (F - self.target).conj().swapaxes(1, 2), F)
+        moved = 2 * (back * by).real / self.size2[:, None]
         slope = np.trapezoid(moved, np.log(self.band), axis=1).ravel() / self._mean(x)
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
@@ -193,15 +198,15 @@ class SampledLoop:
 
     def _margin_slopes(self, x: Array) -> Array:
         """Return the gradient of `_margins`, (k, entries of x)."""
-        around, (_, v), (mu, moves) = self._around(x, "conditions"), self._least(x), self.mu(x)
+        (G, by), (_, v), (mu, moves) = self._imposed.around(self._gains(x)), self._least(x), self.mu(x)
         m, active = self.loop.channels, self.active
-        Gv = np.einsum("kij,kj->ki", around.G, v[:, :m])
+        Gv = np.einsum("kij,kj->ki", G, v[:, :m])
         _, of_G, of_mu, of_both = self._affine
         of_G = of_G + of_both * self._spread(mu)
         left = v[:, :m].conj() * of_G[:, :m]
         left[:, active] += v[:, m:].conj() * of_G[:, m : m + active.size]
-        turned = np.einsum("ki,kij->kj", left, around.G) * Gv
-        slope = [*(turned * around.by).real]
+        turned = np.einsum("ki,kij->kj", left, G) * Gv
+        slope = [*(turned * by).real]
         if active.size:
             rows = np.concatenate([v[:, :m], v[:, m:], v[:, active], v[:, m:]], axis=1).conj()
             here = np.concatenate([v[:, :m], v[:, active], v[:, m:], v[:, m:]], axis=1)
@@ -219,7 +224,8 @@ class SampledLoop:
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
         """Return He of the block: upper left (k, m, m), lower left (k, active, m), lower right's diagonal."""
-        G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
+        G, mu = self._imposed.around(self._gains(x))[0], self._spread(self.mu(x)[0])
+        m, p = self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu
         first, below = of_G[:, :m, None] * G, of_G[:, m : m + p, None] * G[:, self.active] / 2
@@ -400,17 +406,13 @@ class KnownDeviceLoop(SampledLoop):
 
     def _impose(self, w: Array) -> None:
         self.conditions = w
-        self._sample("conditions", w)
-        self._known.clear()
-        z, m = on_circle(w), self.loop.channels
-        one = Sampled(z[None], np.broadcast_to(np.eye(m, dtype=np.complex128), (1, w.size, m, m)), self.loop.T)
-        self._lines = np.diagonal(self.loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]  # Theta
-        self._z = z
+        self._imposed = _Responses(self.delayed, w, self.delta)
+        self._lines = _theta(self.loop, self._imposed.z)
 
     def _complement(self, x: Array) -> tuple[Array, Complex, Complex]:
         """Return the least eigenvalue (k,) in units of delta/T, its eigenvector v (k, m), and M v/(4 l22) (k, m)."""
-        beta, z = self.beta(x), self._z
-        F = self._lines * self._around(x, "conditions").G
+        beta, z = self.beta(x), self._imposed.z
+        F = self._lines * self._imposed.around(self._gains(x))[0]
         cost = period_cost(self.loop, np.full(z.size, self.share), beta)
         own, cross, speed = device_rows(z, cost)
         one = np.eye(beta.size)
@@ -427,11 +429,11 @@ class KnownDeviceLoop(SampledLoop):
     def _margin_slopes(self, x: Array) -> Array:
         """Return the gradient of `_margins`, with finite differences for beta."""
         room, v, below = self._complement(x)
-        around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
+        (G, by), z, m = self._imposed.around(self._gains(x)), self._imposed.z, self.loop.channels
         left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]
-        sent = np.einsum("kij,kj->ki", around.G, v)
-        turned = np.einsum("ki,kij->kj", left * self._lines[:, :, 0], around.G) * sent
-        slope = [*(turned * around.by).real]
+        sent = np.einsum("kij,kj->ki", G, v)
+        turned = np.einsum("ki,kij->kj", left * self._lines[:, :, 0], G) * sent
+        slope = [*(turned * by).real]
         for i in range(self.active.size):
             step = x.copy()
             step[2 * m + i] += _DIFFERENCE

@@ -8,9 +8,10 @@ proves, if there is one. Since R(1) = g I, the static stiffness is F(1) = g E(1)
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,12 @@ from haptic_loop.design import budgets, program
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.conditions import Condition, ratio_in
 from haptic_loop.design.conditions import this_environment as requirement_of
-from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.known_device import KNOWN_DEVICE, KnownDevice, LimitedKnownDevice, largest_beta
 from haptic_loop.design.result import Design, DesignFailed, NotProved
 from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
-from haptic_loop.design.worst_member import Searched, search_ranges
+from haptic_loop.design.worst_member import search_ranges
 
 _SETTLED_DB = 0.05  # [dB] A basis that gains less ends the search; under this-environment only from _FEWEST_TAPS on.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
@@ -76,80 +76,66 @@ class Optimal(Design):
     figures: Transparency = field(kw_only=True)
     g: float = field(kw_only=True)  # F(1) = g E(1); for couplings other than force filters, norm(F(1))/norm(E(1))
     states: int = field(kw_only=True)  # order of the loop
-    certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
     bases: tuple[_BasisResult, ...] = field(kw_only=True, default=())
     reason: str | None = field(kw_only=True, default=None)  # reason why there is no proof, or None
-    searched: Searched | None = field(kw_only=True, default=None)  # result of the search between the vertices of ranges
 
     @property
     def proved(self) -> bool:
         return self.certificate is not None
 
 
+_Progress = Callable[[str, int, int], None]  # called with (task, number of finished bases, number of all bases)
+
+
+def _silent(task: str, finished: int, bases: int) -> None:
+    """Report no progress."""
+
+
 def design_with(
-    loop: Loop,
-    condition: str = THIS_ENVIRONMENT.name,
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
-    **options: Any,
+    loop: Loop, condition: str = THIS_ENVIRONMENT.name, progress: _Progress = _silent, **options: Any
 ) -> Optimal:
-    """Design the optimal coupling under `condition` for Options(**options).
-
-    `progress` is called before each part of the work with (its name, number of finished bases, number of all bases).
-    """
-    chosen, finished = program.Options(**options), list[_BasisResult]()
-
-    def say(what: str) -> None:
-        last = f" (last filter: {finished[-1].mismatch_db:z.2f} dB)" if finished else ""
-        progress(f"{what}{last}", len(finished), len(chosen.bases))
-
+    """Design the optimal coupling under `condition` for Options(**options); `progress` is called before each task."""
     made = _for_known_devices if condition == KNOWN_DEVICE.name else design
-    return made(loop, chosen, progress=finished.append, say=say)
+    return made(loop, program.Options(**options), progress)
 
 
-def design(
-    loop: Loop,
-    options: program.Options = program.DEFAULT,
-    progress: Callable[[_BasisResult], None] = lambda result: None,
-    say: Callable[[str], None] = lambda what: None,
-) -> Optimal:
+def design(loop: Loop, options: program.Options = program.DEFAULT, progress: _Progress = _silent) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
     With ranges around the environment, a proved coupling satisfies this-environment at every vertex (at 128 if there
     are more) and at every point that the search between the vertices visits. With a range of delays, any switching
     within the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
     candidates, too: the environment scaled down (R = kappa I) and the best spring-damper. The function returns the best
-    candidate. `progress` is called after each basis, and `say` before each part of the work with the part's name.
+    candidate.
 
     Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
     that has no design in this loop, and for a loop that no damping makes safe without a coupling.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta, the damping of devices, is {list(loop.delta)}, expected positive numbers [N s/m]")
-    search = replace(_Search.of(loop, options), say=say)
+    search = _Search.of(loop, options, progress)
     if exactly := search.nothing():
         return exactly
-    improving, results, hurried = _over_bases(search, progress)
+    improving, hurried = _over_bases(search)
     best = improving[-1] if improving else None
-    proved_last = improving[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
-    for candidate in proved_last:
-        say("searching the ranges" if loop.ranges else "proving the coupling")
+    # With a limiter each basis uses the multipliers of an earlier proof, so that no proof is left for later.
+    unproved = [] if options.limiter else improving[::-1][: budgets.RANGED_BASES if loop.ranges else None]
+    for candidate in unproved:
+        search.say("searching the ranges" if loop.ranges else "proving the coupling")
         best = search.between(candidate) if loop.ranges else search.proved_or_smaller(candidate)
         hurried |= best.searched is not None and best.searched.ended == "clock"
         if best.proved:
             break
     if best is None or not best.proved or search.mismatch(best) > _HOPELESS:
-        say("designing simpler couplings to compare")
+        search.say("designing simpler couplings to compare")
         rivals = [one for one in (best, search.scaled(), search.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, search.merit(one)))
-    return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
+    return search.finished(best, hurried)
 
 
-def _over_bases(
-    search: _Search, progress: Callable[[_BasisResult], None]
-) -> tuple[list[Optimal], list[_BasisResult], bool]:
-    """Return the successive best couplings, the result of each basis, and whether --seconds ended the search."""
-    improving: list[Optimal] = []
-    results: list[_BasisResult] = []
+def _over_bases(search: _Search) -> tuple[list[Optimal], bool]:
+    """Return the successive best couplings, and whether --seconds ended the search."""
+    improving, results = list[Optimal](), search.results
     floor, gained = _felt(min(search.simple, 1.0)), np.inf
     for taps, poles in search.options.bases:
         if taps > _LARGE and gained < _PROMISING_DB:
@@ -159,11 +145,12 @@ def _over_bases(
         best = improving[-1] if improving else None
         search.say(f"optimising a filter of {taps} taps and {poles} poles")
         try:
-            with within(search.left if results else np.inf, "a larger basis", clock=search.over if results else None):
+            left = max(budgets.GROWTH - units_since(search.spent), 0.0)
+            with within(left if results else np.inf, "a larger basis", clock=search.over if results else None):
                 least = _SETTLED_DB if taps > _LARGE else -np.inf
                 candidate, result = search.over_basis(taps, poles, best, floor, least)
         except TooLong:
-            return improving, results, search.over()
+            return improving, search.over()
         gained = np.inf if result.reason else search.gained(best, candidate)
         if best and candidate.g < floor and result.certified:
             result = replace(
@@ -172,19 +159,18 @@ def _over_bases(
         elif gained <= 0 or result.reason == _SETTLED:
             result = replace(result, rejected=f"{_SETTLED}, with lost stiffness counted")
         results.append(result)
-        progress(result)
         if result.taken:
             floor = max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * candidate.g))
             improving.append(candidate)
         if result.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[search.simply]):
             break
         if search.over():
-            return improving, results, True
+            return improving, True
         last = results[-budgets.UNPROVED_BASES :]
         hopeless = len(last) == budgets.UNPROVED_BASES and not any(each.certified for each in last)
         if hopeless and not search.loop.ranges:
             break
-    return improving, results, False
+    return improving, False
 
 
 #: tried shares of the largest beta, the same in all channels, because different shares gain hardly anything
@@ -192,12 +178,7 @@ _ETAS = 0.15, 0.3, 0.5
 _SCALINGS = 6  # largest number of scalings of the forces; each reduces them by at least the share MARGIN
 
 
-def _for_known_devices(
-    loop: Loop,
-    options: program.Options,
-    progress: Callable[[_BasisResult], None] = lambda result: None,
-    say: Callable[[str], None] = lambda what: None,
-) -> Optimal:
+def _for_known_devices(loop: Loop, options: program.Options, progress: _Progress) -> Optimal:
     """Return the best coupling under known-device, or under this-environment if that is better.
 
     For fixed beta and fixed multipliers of the facts (design.facts) the block is affine in the forces. The filter over
@@ -208,16 +189,18 @@ def _for_known_devices(
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise ValueError(f"{KNOWN_DEVICE.name}: {reason}")
-    search = replace(_Search.of(loop, options), condition=KNOWN_DEVICE, say=say)
+    search = replace(_Search.of(loop, options, progress), condition=KNOWN_DEVICE)
     if exactly := search.nothing():
         return exactly
-    plain = design(loop, options, progress, say)
-    best = search.proved_elsewhere(plain)
-    results, eta, multipliers = list(plain.bases), None, search.multipliers(plain.coupling)
+    plain = design(loop, options, progress)
+    search.results.extend(plain.bases)
+    again = search.proved(plain.coupling)
+    best = again if again.proved else plain
+    eta, multipliers = None, search.multipliers(plain.coupling)
     for taps, poles in options.bases:
         if not search.room(taps, poles, 0):
             break
-        say(f"optimising a filter of {taps} taps and {poles} poles for known devices")
+        search.say(f"optimising a filter of {taps} taps and {poles} poles for known devices")
         tried = [
             search.over_known(each, multipliers, search.mismatch(best), taps, poles)
             for each in ([eta] if eta else _ETAS)
@@ -228,14 +211,11 @@ def _for_known_devices(
             )
             eta = float(np.clip(np.exp(-middle / (2 * curved)), _ETAS[0], _ETAS[-1])) if curved > 0 else _ETAS[1]
         candidate = search.scaled_and_proved(min(tried, key=search.merit))
-        result = _BasisResult(
-            taps, poles, candidate.states, search.decibels(candidate), candidate.g, candidate.reason, search.elapsed
-        )
+        result = search.result(taps, poles, candidate)
         gained = search.gained(best, candidate)
         if candidate.proved and gained <= 0:
             result = replace(result, rejected=f"{_SETTLED}, with lost stiffness counted")
-        results.append(result)
-        progress(result)
+        search.results.append(result)
         if result.taken:
             best, multipliers = candidate, search.multipliers(candidate.coupling)
         if gained < _SETTLED_DB or search.over():
@@ -245,9 +225,7 @@ def _for_known_devices(
         best = between if between.proved and search.gained(plain, between) > 0 else plain
     figures = f"{best.condition}, {search.decibels(best):.2f} dB"
     note = f"{figures}; this-environment, for devices of which less is known: {search.decibels(plain):.2f} dB"
-    return replace(
-        best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=search.over(), notes=(note,)
-    )
+    return replace(search.finished(best, search.over()), notes=(note,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,11 +238,12 @@ class _Search:
     bare: float  # required over available damping without a coupling, in the worst environment
     started: float  # clock time [s] of the start, for the report and for --seconds
     spent: int  # counted work at the start
+    progress: _Progress
     condition: Condition = THIS_ENVIRONMENT  # the condition that judges and proves couplings
-    say: Callable[[str], None] = lambda what: None  # called before each part of the work with its name
+    results: list[_BasisResult] = field(default_factory=list)  # of the finished bases; the search appends to it
 
     @classmethod
-    def of(cls, loop: Loop, options: program.Options) -> _Search:
+    def of(cls, loop: Loop, options: program.Options, progress: _Progress) -> _Search:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
@@ -281,13 +260,26 @@ class _Search:
                 constraints.append(program.most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
                 constraints.append(program.worst_mismatch(there, options.band_hz))
-            cases.append(program.Case(there, there.E(), tuple(constraints), weight=0.0 if cases else 1.0))
+            cases.append(program.Case(there, there.E(), tuple(constraints)))
         if options.limiter and (reason := LIMITER.not_designed(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(each.ratio for each in needs)):
             raise ValueError(f"the loop without a coupling: {next(each.reason for each in needs if each.reason)}")
-        return cls(loop, options, tuple(cases), bare, started, spent())
+        return cls(loop, options, tuple(cases), bare, started, spent(), progress)
+
+    def say(self, task: str) -> None:
+        """Report the progress before a task."""
+        last = f" (last filter: {self.results[-1].mismatch_db:z.2f} dB)" if self.results else ""
+        self.progress(f"{task}{last}", len(self.results), len(self.options.bases))
+
+    def result(self, taps: int, poles: int, candidate: Optimal) -> _BasisResult:
+        error = self.decibels(candidate)
+        return _BasisResult(taps, poles, candidate.states, error, candidate.g, candidate.reason, self.elapsed)
+
+    def finished(self, best: Optimal, hurried: bool) -> Optimal:
+        """Return `best` with the results of all bases."""
+        return replace(best, bases=tuple(self.results), sdps=len(self.results), hurried=hurried)
 
     @property
     def elapsed(self) -> float:
@@ -295,10 +287,6 @@ class _Search:
 
     def over(self, share: float = 1.0) -> bool:
         return self.options.seconds is not None and self.elapsed > share * self.options.seconds
-
-    @property
-    def left(self) -> float:
-        return max(budgets.GROWTH - units_since(self.spent), 0.0)
 
     @property
     def constrained(self) -> bool:
@@ -309,11 +297,6 @@ class _Search:
     def simply(self) -> bool:
         """Whether this-environment is the only constraint, without ranges and without a latency."""
         return not (self.constrained or self.loop.latency or self.loop.ranges)
-
-    @property
-    def proves_last(self) -> bool:
-        """Whether proofs come after all bases. With a limiter each basis uses the multipliers of an earlier proof."""
-        return not self.options.limiter
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
         """Return the certified limiter of the solution `before`, or those of _LAGS; (None,) without the limiter."""
@@ -365,7 +348,7 @@ class _Search:
         more = any(len(case.constraints) > 1 for case in self.cases)
         if more or not exact_delay:
             return None
-        candidate = self._assessed(NoCoupling(), 1.0)
+        candidate = self._assessed(NoCoupling())
         if candidate.requirement.ratio > 1 - program.MARGIN:
             return None
         candidate = self._proved(candidate, self.slips(None)[0])
@@ -400,9 +383,7 @@ class _Search:
             candidate = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
             if candidate.g >= floor or candidate.reason:
                 break
-        return candidate, _BasisResult(
-            taps, poles, candidate.states, self.decibels(candidate), candidate.g, candidate.reason, self.elapsed
-        )
+        return candidate, self.result(taps, poles, candidate)
 
     def solved(
         self,
@@ -427,11 +408,10 @@ class _Search:
         for share in _RESERVES:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
-            scaled = _scaled(coupling, min(scale, limit / max(needs)))
-            candidate = self._assessed(scaled, scaled.g)
+            candidate = self._assessed(_scaled(coupling, min(scale, limit / max(needs))))
             if self.gained(before, candidate) < least:
                 return replace(candidate, reason=_SETTLED)
-            if self.proves_last:
+            if not self.options.limiter:
                 return candidate
             tried.append(self._proved(candidate, slip))
             if tried[-1].proved:
@@ -440,15 +420,10 @@ class _Search:
 
     def proved_or_smaller(self, candidate: Optimal) -> Optimal:
         """Return the coupling with a proof, its forces scaled down if necessary, or unproved if all scalings fail."""
-        coupling, needs = candidate.coupling, candidate.requirement.ratio
+        coupling, needs = candidate.coupling, max(candidate.requirement.ratio, 1 - program.MARGIN)
         assert isinstance(coupling, ForceFilter)
-        proved = self._proved(candidate, None)
-        for share in _RESERVES[1:]:
-            if proved.proved:
-                break
-            smaller = _scaled(coupling, (1 - share * program.MARGIN) / max(needs, 1 - program.MARGIN))
-            proved = self._proved(self._assessed(smaller, smaller.g), None)
-        return proved
+        smaller = (_scaled(coupling, (1 - share * program.MARGIN) / needs) for share in _RESERVES[1:])
+        return self.first_proved(chain([candidate], map(self._assessed, smaller)))
 
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
@@ -487,8 +462,7 @@ class _Search:
             coupling = _scaled(unscaled, share)
             # The required damping is proportional to the forces.
             lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)
-            last = self._proved(self._assessed(coupling, coupling.g), None)
-            last = replace(last, searched=replace(searched, worst=lower))
+            last = replace(self.proved(coupling), searched=replace(searched, worst=lower))
             if last.proved:
                 break
         return last
@@ -499,7 +473,7 @@ class _Search:
         for _ in range(_SCALINGS):
             needs = required_damping(self.loop, coupling, self.condition)
             if needs.certified:
-                last = self._proved(self._assessed(coupling, coupling.g), None)
+                last = self.proved(coupling)
                 values = needs.multiplier
 
                 def ratio(there: Loop, coupling: Coupling = coupling, values: Any = values) -> float:
@@ -519,31 +493,29 @@ class _Search:
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)
         kappa = self._start(problem)[0] if self.constrained else min(1.0, self.simple)
-        for share in (1.0, 0.97, 0.9, 0.7, 0.5):
-            part = np.floor(share * kappa * 1e6) / 1e6
-            candidate = self._proved(self._assessed(span.filter(np.array([part])), part), slip)
-            if candidate.proved:
+        shares = (np.floor(share * kappa * 1e6) / 1e6 for share in (1.0, 0.97, 0.9, 0.7, 0.5))
+        return self.first_proved((self._assessed(span.filter(np.array([share]))) for share in shares), slip)
+
+    def first_proved(self, candidates: Iterable[Optimal], slip: program.Slip | None = None) -> Optimal:
+        """Return the first candidate that is proved, or the last one with the reason why its proof failed."""
+        for candidate in candidates:
+            result = self._proved(candidate, slip)
+            if result.proved:
                 break
-        return candidate
+        return result
 
     def spring_damper(self) -> Optimal | None:
         """Return the best spring-damper; None if there is none, or with ranges, a latency or further constraints."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
-            gains = design_spring_damper(self.loop, "this-environment", limiter=False).coupling
-            return self._proved(self._assessed(gains, np.nan), None)
+            return self.proved(design_spring_damper(self.loop, "this-environment", limiter=False).coupling)
         except (DesignFailed, ValueError):
             return None
 
     @property
     def known(self) -> KnownDevice:
         return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
-
-    def proved_elsewhere(self, plain: Optimal) -> Optimal:
-        """Return `plain` with a proof of the search's condition, or `plain` as it is if this proof fails."""
-        candidate = self._proved(self._assessed(plain.coupling, plain.g), None)
-        return candidate if candidate.proved else plain
 
     def multipliers(self, coupling: Coupling) -> tuple[float, ...]:
         """Return the facts' multipliers with which known-device requires the least damping, or their start values."""
@@ -571,14 +543,14 @@ class _Search:
         soft = program.SOFT[0] * min(error, program.SOFT[1])
         problem = program.Problem(self.span(taps, poles), tuple(map(constrained, self.cases)), self.options, soft)
         coupling, _ = self.kept_in_all(problem, need)
-        return self._assessed(coupling, coupling.g, whole)
+        return self._assessed(coupling, whole)
 
     def scaled_and_proved(self, candidate: Optimal) -> Optimal:
         """Scale the forces down until known-device is proved with the best beta, at most _SCALINGS times."""
         coupling = candidate.coupling
         assert isinstance(coupling, ForceFilter)
         for _ in range(_SCALINGS):
-            candidate = self._proved(self._assessed(coupling, coupling.g), None)
+            candidate = self.proved(coupling)
             if candidate.proved:
                 break
             coupling = _scaled(coupling, (1 - program.MARGIN) * min(1.0, 1 / candidate.requirement.ratio))
@@ -591,12 +563,12 @@ class _Search:
         rho (Re M/z - beta/4), where the multiplier M satisfies Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
-        grids = [problem.grid(*pair) for pair in problem.pairs]
+        grids = [problem.grid(part) for part in problem.parts]
         while problem.room(start := problem.start(kappa), grids) <= 0:
             kappa /= 2
         return start
 
-    def _assessed(self, coupling: Coupling, g: float, multiplier: Sequence[float] | None = None) -> Optimal:
+    def _assessed(self, coupling: Coupling, multiplier: Sequence[float] | None = None) -> Optimal:
         """Return the coupling with its figures and its swept requirement, without a proof.
 
         For known-device, `multiplier` holds beta, zeros in place of the bounds of q (`known_device._q_bounds`), and
@@ -617,14 +589,15 @@ class _Search:
             objective,
             figures.rms_mismatch if objective == "rms" else figures.relative_mismatch,
             requirement,
-            sdps=0,
-            wall_s=self.elapsed,
             figures=figures,
-            g=figures.dc_ratio if np.isnan(g) else g,
+            g=1.0 if isinstance(coupling, NoCoupling) else getattr(coupling, "g", figures.dc_ratio),
             states=F.order,
-            certificate=None,
             reason=None if requirement.certified else requirement.reason or "the sweep does not certify it",
         )
+
+    def proved(self, coupling: Coupling, slip: program.Slip | None = None) -> Optimal:
+        """Return the coupling with its certificate, or with the reason why the proof failed."""
+        return self._proved(self._assessed(coupling), slip)
 
     def _proved(self, candidate: Optimal, slip: program.Slip | None) -> Optimal:
         """Return `candidate` with its certificate, or with the reason why the proof failed."""
@@ -640,10 +613,10 @@ class _Search:
                     loop, coupling, THIS_ENVIRONMENT, swept=None if loop.varying_delay else candidate.requirement
                 )
         except NotProved as error:
-            return replace(candidate, wall_s=self.elapsed, reason=str(error))
+            return replace(candidate, reason=str(error))
         needs = certificate.required if loop.varying_delay else candidate.requirement.required
         requirement = replace(candidate.requirement, required=needs, proof="rational")
-        return replace(candidate, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
+        return replace(candidate, requirement=requirement, certificate=certificate, reason=None)
 
 
 def _felt(g: float) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -326,7 +326,7 @@ def _separate(modes: Complex) -> list[complex]:
     return distinct
 
 
-_Pairs = list[tuple["Case", _Constraint]]
+_Part = tuple["Case", _Constraint, slice]  # a constraint in a case, and the indices of its own unknowns
 _Posed = tuple[Program, Array, Callable[[Array], Array]]
 
 # the problem -----------------------------------------------------------------------------------------------------
@@ -334,12 +334,11 @@ _Posed = tuple[Program, Array, Callable[[Array], Array]]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One environment with its constraints and the weight of its mismatch."""
+    """One environment with its constraints."""
 
     loop: Loop  # loop with this environment, without ranges
     E: Lti
     constraints: tuple[_Constraint, ...] = ()
-    weight: float = 1.0
 
     def delayed(self, z: Complex) -> Sampled:
         """Return Psi E at z (k,)."""
@@ -351,32 +350,28 @@ class Problem:
     """Objective and inequalities in the unknowns [g, R_1, R_2, .., own unknowns of the constraints]."""
 
     span: Span
-    cases: tuple[Case, ...]
+    cases: tuple[Case, ...]  # Only the mismatch in the first environment is minimised.
     options: Options
     soft: float  # weight of the force above 100 Hz
     heavier: float = 1.0  # factor on the weight of the static stiffness
 
-    @property
-    def own(self) -> list[tuple[int, int]]:
-        """The first and end index of each constraint's own unknowns, case by case."""
-        counts = [len(constraint.start) for case in self.cases for constraint in case.constraints]
-        return list(pairwise(accumulate(counts, initial=self.span.unknowns)))
-
-    @property
-    def pairs(self) -> _Pairs:
-        return [(case, constraint) for case in self.cases for constraint in case.constraints]
+    @cached_property
+    def parts(self) -> list[_Part]:
+        parts, end = list[_Part](), self.span.unknowns
+        for case in self.cases:
+            for constraint in case.constraints:
+                first, end = end, end + len(constraint.start)
+                parts.append((case, constraint, slice(first, end)))
+        return parts
 
     @property
     def unknowns(self) -> int:
-        return self.span.unknowns + sum(len(c.start) for case in self.cases for c in case.constraints)
+        return self.span.unknowns + sum(len(constraint.start) for _, constraint, _ in self.parts)
 
     def start(self, kappa: float) -> Array:
         """Return the unknowns of R = kappa I, with the constraints' own unknowns at their start."""
-        x = np.zeros(self.unknowns)
-        x[0] = kappa
-        own = [value for case in self.cases for constraint in case.constraints for value in constraint.start]
-        x[self.span.unknowns :] = own
-        return x
+        own = [value for _, constraint, _ in self.parts for value in constraint.start]
+        return np.array([kappa, *np.zeros(self.span.unknowns - 1), *own])
 
     def objective(self) -> tuple[Array, Array, Array]:
         """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness, size of R.
@@ -384,7 +379,7 @@ class Problem:
         Each device's row of R is a separate least-squares problem, which is reduced to its triangular factor. They
         share only g, so that A has few more rows than unknowns.
         """
-        parts = [part for case in self.cases if case.weight for part in self._weighed(case)]
+        parts = self._weighed()
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
         for i in range(self.cases[0].E.inputs):
             mine = np.concatenate([[0], 1 + np.flatnonzero(row_of == i)])
@@ -399,37 +394,37 @@ class Problem:
         of_g = np.zeros((2, self.unknowns))
         of_g[:, 0] = held, _SMALL
         cost = np.zeros(self.unknowns)
-        cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
+        cost[self.span.unknowns :] = [value for _, constraint, _ in self.parts for value in constraint.cost]
         return np.vstack([*rows, of_g]), np.concatenate([*right, [held, 0.0]]), cost
 
-    def _weighed(self, case: Case) -> list[tuple[Case, Array, Complex, Complex]]:
-        """Return parts (case, w, L, target L) of the objective |F L - target L|^2.
+    def _weighed(self) -> list[tuple[Array, Complex, Complex]]:
+        """Return parts (w, L, target L) of the objective |F L - target L|^2.
 
         L contains weight/|E|, and for the mismatch also `_evened`; the target of soft rows is zero.
         """
-        loop, weights = case.loop, []
+        case, weights = self.cases[0], list[tuple[Array, Complex, Complex]]()
 
         def add(w: Array, weight: Array, ideal: bool) -> None:
             E, z = case.E.at(on_circle(w)), on_circle(w)
             size = np.linalg.norm(E, axis=(1, 2))
             L = (weight / size)[:, None, None] * (_evened(E, size) if ideal else np.eye(case.E.inputs))
-            target = (z[:, None] ** -np.asarray(loop.lam))[..., None] * E if ideal else np.zeros_like(E)
-            weights.append((case, w, L, target @ L))
+            target = (z[:, None] ** -np.asarray(case.loop.lam))[..., None] * E if ideal else np.zeros_like(E)
+            weights.append((w, L, target @ L))
 
-        low, high = in_band(self.options.band_hz, loop.T)
+        low, high = in_band(self.options.band_hz, case.loop.T)
         if self.options.objective == "rms":
             w = frequencies(case.E, low=low, high=high, points=80)
             logarithm = np.log(w)
             weight = np.gradient(logarithm) / (logarithm[-1] - logarithm[0])
-            add(w, np.sqrt(case.weight * weight), ideal=True)
-        edge = 2 * np.pi * HIGH_HZ * loop.T
+            add(w, np.sqrt(weight), ideal=True)
+        edge = 2 * np.pi * HIGH_HZ * case.loop.T
         if edge < np.pi and self.soft > 0:
-            add(np.geomspace(edge, np.pi, 20), np.full(20, self.soft * np.sqrt(case.weight / 20)), ideal=False)
+            add(np.geomspace(edge, np.pi, 20), np.full(20, self.soft * np.sqrt(1 / 20)), ideal=False)
         return weights
 
-    def _force_rows(self, case: Case, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
+    def _force_rows(self, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
         """Return row i of F L for each of the unknowns `mine`, and row i of `target`, as real rows."""
-        z = on_circle(w)
+        case, z = self.cases[0], on_circle(w)
         moved = case.delayed(z).G[0] @ L * (z ** -float(case.loop.theta[i]))[:, None, None]
         functions, signals = self.span.responses(z), self.span.sources() @ moved
         function, _, source = np.argwhere(self.span.used)[mine[1:] - 1].T
@@ -450,16 +445,17 @@ class Problem:
         G[np.arange(1, len(G)), :, which[:, 1]] = np.swapaxes(through, 0, 1)
         return Sampled(z[None], G, case.loop.T)
 
-    def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> MatrixInequality:
+    def block(self, part: _Part, w: Array) -> MatrixInequality:
         """Return the inequality of a constraint at the frequencies w, from the block at each unit vector."""
+        case, constraint, own = part
         slopes = self._slopes(case, on_circle(w))
-        nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
+        nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own.stop - own.start)
         none = np.zeros(len(units))
         constant = constraint.at(nothing, none)
         moved = constraint.at(slopes, none) - constant
         slope = np.zeros((self.unknowns, *constant.shape[1:]), dtype=complex)
         slope[: len(moved)] = moved
-        for a, unit in enumerate(units, start=own[0]):
+        for a, unit in enumerate(units, start=own.start):
             slope[a] = (constraint.at(nothing, unit) - constant)[0]
         return MatrixInequality.of(constant[0], np.swapaxes(slope, 0, 1))
 
@@ -469,9 +465,9 @@ class Problem:
         slope[0, at] = 1
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
-    def _dense(self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], x: Array) -> _Posed:
+    def _dense(self, A: Array, b: Array, c: Array, imposed: list[Array], x: Array) -> _Posed:
         """Return (program in well-conditioned coordinates y, feasible y of x, map from y to x)."""
-        parts = [self.block(*one, own, w) for one, own, w in zip(pairs, self.own, imposed, strict=True)]
+        parts = [self.block(part, w) for part, w in zip(self.parts, imposed, strict=True)]
         program, U = Program(A, b, c, joined([*parts, self._positive(0)])).conditioned(x)
         return program, U @ x, lambda y: solve_triangular(U, y)
 
@@ -479,9 +475,9 @@ class Problem:
     def _entries(self) -> bool:
         """Whether `_by_entries` applies: R is full, m > 2, and every block is a constant plus L(z) G."""
         full = self.span.used.all() and self.span.used.shape[1] == self.span.used.shape[2] > 2
-        return bool(full) and all(constraint.through for case in self.cases for constraint in case.constraints)
+        return bool(full) and all(constraint.through for _, constraint, _ in self.parts)
 
-    def _by_entries(self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], x: Array) -> _Posed:
+    def _by_entries(self, A: Array, b: Array, c: Array, imposed: list[Array], x: Array) -> _Posed:
         """Return (program, feasible y of x, map from y to x), with y ordered by entries of R, then g.
 
         The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
@@ -500,7 +496,7 @@ class Problem:
             return np.append(y[-1], solve_triangular(U, y[:-1].reshape(-1, n).T).ravel())
 
         blocks: list[MatrixInequality | EntryInequality] = [self._positive(self.unknowns - 1)]
-        for (case, constraint), w in zip(pairs, imposed, strict=True):
+        for (case, constraint, _), w in zip(self.parts, imposed, strict=True):
             delayed = case.delayed(on_circle(w))
             one = Sampled(delayed.z, np.tile(np.eye(m, dtype=complex), (1, w.size, 1, 1)), delayed.T)
             none = np.zeros(0)
@@ -514,8 +510,9 @@ class Problem:
         program = Program(np.column_stack([by_entry, A[:, 0]]), b, there(c), tuple(blocks))
         return program, there(x), back
 
-    def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
+    def least(self, part: _Part, x: Array, w: Array) -> Array:
         """Return the least eigenvalue of a constraint at x for each frequency w, (k,)."""
+        case, constraint, own = part
         spend(_POINT * w.size)
         z = on_circle(w)
         R = self.span.matrices(x) @ self.span.sources()
@@ -523,10 +520,11 @@ class Problem:
         filtered = x[0] * np.eye(m) + (self.span.responses(z) @ R.reshape(n, m * m)).reshape(1, -1, m, m)
         delayed = case.delayed(z)
         G = Sampled(delayed.z, filtered @ delayed.G, delayed.T)
-        return np.linalg.eigvalsh(constraint.at(G, x[own[0] : own[1]])[0])[:, 0]
+        return np.linalg.eigvalsh(constraint.at(G, x[own])[0])[:, 0]
 
-    def grid(self, case: Case, constraint: _Constraint) -> Array:
+    def grid(self, part: _Part) -> Array:
         """Return the initial frequencies of a constraint [rad/sample]."""
+        case, constraint, _ = part
         even = np.linspace(constraint.low, constraint.high, 50)
         rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
@@ -537,23 +535,21 @@ class Problem:
 
     def room(self, x: Array, grids: Iterable[Array]) -> float:
         """Return the least eigenvalue of all constraints at x, each on its own grid of frequencies."""
-        parts = zip(self.pairs, self.own, grids, strict=True)
-        return min(float(self.least(*pair, own, x, w).min(initial=np.inf)) for pair, own, w in parts)
+        parts = zip(self.parts, grids, strict=True)
+        return min(float(self.least(part, x, w).min(initial=np.inf)) for part, w in parts)
 
-    def sweep(self, case: Case, constraint: _Constraint) -> Array:
+    def sweep(self, part: _Part) -> Array:
         """Return a dense grid that resolves every pole, over the band of a constraint [rad/sample]."""
+        case, constraint, _ = part
         return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
         """Return (frequencies of the violations of each constraint in each case, largest violation)."""
-        missing, own, worst = [], iter(self.own), 0.0
-        for case in self.cases:
-            for constraint in case.constraints:
-                mine = next(own)
-                w = self.sweep(case, constraint)
-                fails = lambda w, case=case, constraint=constraint, mine=mine: -self.least(case, constraint, mine, x, w)  # noqa: E731
-                missing.append(peaks(fails, w, above=0.0))
-                worst = max(worst, float(fails(missing[-1]).max(initial=0.0)))
+        missing, worst = [], 0.0
+        for part in self.parts:
+            fails = lambda w, part=part: -self.least(part, x, w)  # noqa: E731
+            missing.append(peaks(fails, self.sweep(part), above=0.0))
+            worst = max(worst, float(fails(missing[-1]).max(initial=0.0)))
         return missing, worst
 
     def solve(self, start: Array) -> Array:
@@ -561,7 +557,7 @@ class Problem:
 
         If PROGRAM_SWEEPS rounds are not enough, larger violations are left to `_kept` or to the caller.
         """
-        pairs, imposed = self.pairs, [self.grid(*pair) for pair in self.pairs]
+        imposed = [self.grid(part) for part in self.parts]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
         nothing = float(b @ b) + float(c.any())  # objective of zero force, whose relative mismatch is 1
@@ -569,7 +565,7 @@ class Problem:
         demanding = any(len(case.constraints) > 1 for case in self.cases)
         path, gaps, inner, x = list[tuple[Array, float]](), list(_GAPS), start, start
         for _ in range(budgets.PROGRAM_SWEEPS):
-            program, y, back = posed(A, b, c, pairs, imposed, x)
+            program, y, back = posed(A, b, c, imposed, x)
             path = path or [(start, program.degree / max(program.value(y), 1e-12))]
 
             def onward(y: Array, t: float, program: Program = program, gap: float = gaps[0]) -> float:
@@ -597,7 +593,7 @@ class Problem:
         """
         _, worst = self.missed(x)
         for base in (inner, start):
-            if (room := self.room(base, [self.sweep(*pair) for pair in self.pairs])) > 0:
+            if (room := self.room(base, [self.sweep(part) for part in self.parts])) > 0:
                 return base + max(0.0, 1 - 1.01 * worst / (worst + room)) * (x - base)
         return start
 
