@@ -15,7 +15,6 @@ from typing import Any, NoReturn
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from haptic_loop import _leave
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.units import in_unit
@@ -25,11 +24,12 @@ from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
 
 
-def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
+def execute(main: Callable[[list[str]], int], argv: list[str] | None = None, alone: bool = False) -> NoReturn:
     """Run a command and exit with its exit code. For bad input, print one line on standard error.
 
     The reader of standard output may stop at any line (`| head -1`) without changing the exit code. Temporary files are
-    removed if SIGTERM or Ctrl-C ends the command.
+    removed if SIGTERM or Ctrl-C ends the command. If the command is `alone` in its process, Ctrl-C interrupts it, and a
+    further Ctrl-C ends the process.
     """
     code: str | int | None
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
@@ -39,7 +39,6 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     sys.unraisablehook = _repeat_interrupt
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
-    alone = signal.getsignal(signal.SIGINT) is _leave  # whether this process runs only this command
     try:
         if alone:
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,18 +1,22 @@
 """Run the commands: as haptic-loop COMMAND, and as python -m sim.run and other modules, which call `run_command`.
 
-This module imports nothing that takes time, so that the process that draws the picture (cli.painter) starts at once.
+This module imports nothing that takes time, so that Ctrl-C is handled and the process that draws the picture
+(cli.painter) starts at once.
 """
 
 from __future__ import annotations
 
 import atexit
 import gc
+import os
+import signal
 import sys
 from importlib import import_module
-from types import ModuleType
-from typing import NoReturn
 
-from haptic_loop.cli import painter
+TYPE_CHECKING = False  # Importing it from typing takes time.
+if TYPE_CHECKING:
+    from types import ModuleType
+    from typing import Any, NoReturn
 
 #: command -> (module of python -m, purpose); the file of the same name in this folder has the code
 COMMANDS = {
@@ -58,7 +62,23 @@ def main() -> NoReturn:
     _run(words[0], words[1:])
 
 
+def _leave(number: int, frame: Any) -> NoReturn:
+    """Leave at Ctrl-C before the command begins, when there is nothing to clean up."""
+    try:
+        os.write(2, b"interrupted\n")
+    finally:
+        os._exit(130)
+
+
 def _run(command: str, words: list[str]) -> NoReturn:
+    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # False after nohup
+    if interruptible:
+        signal.signal(signal.SIGINT, _leave)
+    # Commands do not use the OpenGL backend that MUJOCO_GL names; sim.view opens a context itself. Importing the
+    # backend takes longer than the rest of MuJoCo, and fails if it is not installed.
+    os.environ["MUJOCO_GL"] = "disable"
+    from haptic_loop.cli import painter
+
     if command == "run" and not {"--no-plot", "-h", "--help"} & {*words}:
         painter.begin()
     atexit.register(gc.freeze)  # This prevents a last search for garbage, which takes 0.1 s.
@@ -66,7 +86,7 @@ def _run(command: str, words: list[str]) -> NoReturn:
     from haptic_loop.design import forked
 
     forked.allowed = True
-    execute(lambda argv: _command(command).main(argv), words)
+    execute(lambda argv: _command(command).main(argv), words, interruptible)
 
 
 def _command(name: str) -> ModuleType:

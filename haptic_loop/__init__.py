@@ -22,13 +22,11 @@ start quickly.
 from __future__ import annotations
 
 import os
-import signal
-import sys
 from importlib import import_module
 
 TYPE_CHECKING = False  # Importing it from typing takes time.
 if TYPE_CHECKING:
-    from typing import Any, NoReturn
+    from typing import Any
 
     from haptic_loop.controller.coupling import NoCoupling, SpringDamper
     from haptic_loop.controller.environment import RIGID_WALL, Network, Spring, Wall
@@ -68,32 +66,6 @@ __all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 _ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 if os.path.isfile(os.path.join(_ROOT, "pyproject.toml")) and os.path.isdir(os.path.join(_ROOT, "controller")):
     __path__.append(_ROOT)  # in a checkout, haptic_loop.sim is the top-level folder sim
-
-
-def _command_starts() -> bool:
-    """Return whether this process runs a command of this package; argv[0] is "-m" until Python finds the module."""
-    words, started = sys.orig_argv, sys.argv[0] if sys.argv else ""
-    module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
-    files = (os.path.join(*module.split("."), "__main__.py"), os.path.join(*module.split(".")) + ".py")
-    if module.removeprefix("haptic_loop.").split(".")[0] in ("design", "sim", "hw", "cli"):
-        return started == "-m" or started.endswith(files)
-    return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
-
-
-def _leave(number: int, frame: Any) -> NoReturn:
-    """Leave at Ctrl-C before the command begins, when there is nothing to clean up."""
-    try:
-        os.write(2, b"interrupted\n")
-    finally:
-        os._exit(130)
-
-
-# Commands do not use the OpenGL backend that MUJOCO_GL names; sim.view opens a context itself. Importing the backend
-# takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
-if _command_starts():
-    os.environ["MUJOCO_GL"] = "disable"
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute restores this handler
-        signal.signal(signal.SIGINT, _leave)
 
 
 def __getattr__(name: str) -> Any:
