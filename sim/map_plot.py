@@ -115,26 +115,20 @@ def _points(axes: Axes, report: MapReport) -> list[Line2D]:
     if not points:
         return []
     entries, effects = [], "" if report.simulation.nonlinear else ", linear loop"
+
+    def draw(some: Sequence[Any], label: str, **style: Any) -> None:
+        style["linestyle"] = "none"
+        axes.plot([p.B for p in some], [p.K for p in some], clip_on=False, zorder=4, **style)
+        entries.append(Line2D([], [], label=f"{label} ({len(some)})", **style))
+
     kinds = (("rests", "o", "white"), ("oscillates", "X", plots.STYLES[1]["color"]), (UNDECIDED, "D", "grey"))
     for word, marker, face in kinds:
-        some = [p for p in points if p.verdict == word]
-        if not some:
-            continue
-        style = {"marker": marker, "markersize": 5.5, "markerfacecolor": face, "markeredgecolor": "black"}
-        style |= {"linestyle": "none", "markeredgewidth": 0.7}
-        axes.plot([p.B for p in some], [p.K for p in some], clip_on=False, zorder=4, **style)
-        entries.append(Line2D([], [], label=f"MuJoCo{effects}: {word} ({len(some)})", **style))
-    other = [p for p in points if p.differs_from_linear]
-    if other:
-        style = {
-            "marker": "o",
-            "markersize": 11,
-            "markerfacecolor": "none",
-            "markeredgecolor": plots.STYLES[3]["color"],
-        }
-        style |= {"linestyle": "none", "markeredgewidth": 1.6}
-        axes.plot([p.B for p in other], [p.K for p in other], clip_on=False, zorder=4, **style)
-        entries.append(Line2D([], [], label=f"unlike the linear loop ({len(other)})", **style))
+        if some := [p for p in points if p.verdict == word]:
+            edge = {"markeredgecolor": "black", "markeredgewidth": 0.7}
+            draw(some, f"MuJoCo{effects}: {word}", marker=marker, markersize=5.5, markerfacecolor=face, **edge)
+    if other := [p for p in points if p.differs_from_linear]:
+        edge = {"markeredgecolor": plots.STYLES[3]["color"], "markeredgewidth": 1.6}
+        draw(other, "unlike the linear loop", marker="o", markersize=11, markerfacecolor="none", **edge)
     return entries
 
 

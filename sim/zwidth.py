@@ -70,11 +70,6 @@ class _Sweep(ABC):
         return bool(self.loop.environment.walls)
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Names of the conditions, and of further cases, that are evaluated in every cell."""
-        return tuple(self.judges)
-
-    @property
     def decisive(self) -> str:
         """The name of the condition that must hold at every point of --mark."""
         return (self.own or THIS_ENVIRONMENT).name
@@ -193,10 +188,6 @@ class EnvironmentSweep(_Sweep):
         return float(np.exp(np.mean(np.log(stiff)))) if stiff else 1000.0
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        return tuple(self.judges)
-
-    @property
     def refusals(self) -> dict[str, str]:
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
@@ -244,9 +235,9 @@ class EnvironmentSweep(_Sweep):
         for spring, across in zip(varied, network.across(varied), strict=True):
             one = np.outer(across, across)
             pattern, D, S = pattern + one, D - spring.damping * one, S - spring.stiffness * one
-        vary = lambda fixed, value: fixed + np.asarray(value)[:, None, None] * pattern  # noqa: E731
-        M = np.broadcast_to(M, (np.size(K), *M.shape))
-        return self.loop.at(environment.Networks(network.contacts, (M, vary(D, B), vary(S, K))))
+        M = np.broadcast_to(M, (K.size, *M.shape))
+        D, S = D + B[:, None, None] * pattern, S + K[:, None, None] * pattern
+        return self.loop.at(environment.Networks(network.contacts, (M, D, S)))
 
 
 Sweep = CouplingSweep | EnvironmentSweep
@@ -272,7 +263,7 @@ _Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
+class Grid:
     """The cells of a map: every K with every B."""
 
     K: Array  # (n,) [N/m]
@@ -295,7 +286,7 @@ class _Grid:
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
-def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> _Grid:
+def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
     The scale of K is the sweep's stiffness_scale, that of B the largest delta. A linear map goes up to 2.5 times these
@@ -319,7 +310,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
         ends.append((low, high))
     spread = np.linspace if scale == "linear" else np.geomspace
     along_K, along_B = (spread(low, high, n) for low, high in ends)
-    return _Grid(along_K, along_B, scale)
+    return Grid(along_K, along_B, scale)
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
@@ -346,7 +337,7 @@ _SAMPLE = 25  # number of cells that decide which humans are tried first (`HeldD
 class Map:
     """Results over the grid, (cells,) each, B running fastest; nan for cells that an interruption left out."""
 
-    grid: _Grid
+    grid: Grid
     ratio: dict[str, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the tried humans (`_population`)
     unstable: Array  # number of tried humans that make the cell unstable
@@ -357,7 +348,7 @@ class Map:
 
 def draw_map(
     sweep: Sweep,
-    grid: _Grid,
+    grid: Grid,
     held: limit_cycles.HeldDevices,
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],
@@ -365,12 +356,12 @@ def draw_map(
     """Compute the map; `progress` is called with (stage, done, total). After Ctrl-C, return the finished cells."""
     K, B = grid.flat
     seconds, n = {}, K.size
-    ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.conditions}
+    ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.judges}
     growth, unstable = np.full((2, n), np.nan)
     points, stopped = limit_cycles.Points.joined([]), False
 
     def ratios(part: slice) -> tuple[Array, ...]:
-        return tuple(sweep.ratios(name, K[part], B[part]) for name in sweep.conditions)
+        return tuple(sweep.ratios(name, K[part], B[part]) for name in sweep.judges)
 
     def population(part: slice) -> tuple[float, int]:
         return _population(held, [F[part.start] for F in maps], leading)
@@ -382,7 +373,7 @@ def draw_map(
     _ = sweep.refusals  # This fills the cache before threads read it.
     parts, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
     for part, values in parts:
-        for name, value in zip(sweep.conditions, values, strict=True):
+        for name, value in zip(sweep.judges, values, strict=True):
             ratio[name][part] = value
     seconds["certificates"] = time.perf_counter() - begin
     if not stopped:
@@ -477,12 +468,12 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
     growth = _growth(sweep, held, K, B)
     tried = np.geomspace(min(grid_K[0], K), max(grid_K[-1], K), _STEPS)
     stiffest: dict[str, float | None] = {}
-    for name in sweep.conditions:
+    for name in sweep.judges:
         safe = suffices(sweep.ratios(name, tried, np.full(_STEPS, float(B))))
         stiffest[name] = _last(tried, safe, lambda low, high, name=name: _edge(sweep, name, low, high, B))
     settled = np.array([calm(k) for k in tried])
     stiffest["population"] = _last(tried, settled, lambda low, high: _bisected(calm, low, high))
-    requirement = {name: sweep.requirement(name, K, B) for name in sweep.conditions}
+    requirement = {name: sweep.requirement(name, K, B) for name in sweep.judges}
     return Mark(K, B, requirement, float(growth.max()), int((growth > MARGINAL).sum()), stiffest)
 
 

@@ -20,7 +20,7 @@ from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL
 from haptic_loop.sim.trace import slowest_seen
-from haptic_loop.sim.zwidth import Map, MapError, Mark, Sweep, contact_springs, map_error
+from haptic_loop.sim.zwidth import Grid, Map, MapError, Mark, Sweep, contact_springs, map_error
 
 _NOT_REACHED = "not reached before the interruption"
 
@@ -114,15 +114,6 @@ class FixedCoupling:
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
-    """The cells: rows are stiffnesses K [N/m], columns are dampings B [N s/m]."""
-
-    K: Array
-    B: Array
-    scale: str
-
-
-@dataclass(frozen=True, eq=False)
 class _Simulated:
     """The figures of MuJoCo at some of the cells."""
 
@@ -175,7 +166,7 @@ class MapReport:
     delta: tuple[float, ...]
     walls: bool
     conditions: list[str]
-    grid: _Grid
+    grid: Grid
     population: _Population
     simulation: _Simulated
     holds: bool  # every mark is certified, and no result contradicts another
@@ -216,7 +207,7 @@ class MapReport:
             loop.delta,
             sweep.walls,
             list(drawn.ratio),
-            _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),
+            drawn.grid,
             _population(drawn, humans, seed),
             simulation,
             certified and not contradicted,

@@ -94,7 +94,7 @@ def test_bare_walls_match_colgates_condition():
 
 def test_any_environment_requires_the_same_in_all_cells():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
-    assert sweep.conditions == ("any-environment", "this-environment")
+    assert tuple(sweep.judges) == ("any-environment", "this-environment")
     ratios = sweep.ratios("any-environment", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
     assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 

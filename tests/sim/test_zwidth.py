@@ -35,7 +35,7 @@ from haptic_loop.sim.limit_cycles import UNDECIDED, HeldDevices, Plan, Points, _
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import dominant_mode, exact_loops
 from haptic_loop.sim.trace import oscillation, slowest_seen
-from haptic_loop.sim.zwidth import CouplingSweep, Map, Mark, _Grid, draw_map, make_grid
+from haptic_loop.sim.zwidth import CouplingSweep, Grid, Map, Mark, draw_map, make_grid
 from haptic_loop.sim.zwidth_report import MapReport
 
 DELTA, T = 1.37, 1e-3
@@ -398,7 +398,7 @@ def test_slow_rates_contradict_no_simulation():
 def points(sweep, K, B, **changes):
     """Return the simulated points of a 2 x 2 map, its four corners."""
     settings = {"points": 2, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
-    grid = _Grid(np.array(K), np.array(B), "linear")
+    grid = Grid(np.array(K), np.array(B), "linear")
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     return draw_map(sweep, grid, crowd, Plan(**settings), lambda *stage: None).points
 
@@ -501,14 +501,14 @@ def test_the_parts_of_a_map_agree(audit):
 
 def test_a_failing_mark_or_cell_is_reported():
     """A map holds if its marks are certified, no hand contradicts a certificate, and no linear simulation differs."""
-    sweep, grid = rigid(0), _Grid(np.array([1.0, 2.0]), np.array([0.0, 1.0]), "linear")
+    sweep, grid = rigid(0), Grid(np.array([1.0, 2.0]), np.array([0.0, 1.0]), "linear")
     good, bad = (
-        Mark(K, 0.0, {name: sweep.requirement(name, K, 0.0) for name in sweep.conditions}, -1.0, 0, {})
+        Mark(K, 0.0, {name: sweep.requirement(name, K, 0.0) for name in sweep.judges}, -1.0, 0, {})
         for K in (100.0, 5000.0)
     )
 
     def report(growth, *marks, sweep=sweep, points=None):
-        ratio = dict.fromkeys(sweep.conditions, np.array([0.1, 0.2, 0.3, np.inf]))
+        ratio = dict.fromkeys(sweep.judges, np.array([0.1, 0.2, 0.3, np.inf]))
         growths, points = np.array([-1.0, growth, -1.0, -1.0]), points or Points.joined([])
         drawn = Map(grid, ratio, growths, np.zeros(4), points, {}, False)
         return MapReport.of(PAIR, sweep, drawn, Plan(0, 3.0, 2.0, 1e-5), None, marks, 7, 0)
