@@ -66,18 +66,18 @@ def check_loop(loop: Loop) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Margins: the stiffest K, and the errors of the loop's data that the certificate tolerates.
 #
-# The loop is varied and the conditions are evaluated again. A search varies one value in steps until the certificate
-# begins or ends, and narrows the last step down to this edge. It can miss an uncertified interval narrower than a step.
-# The value that it returns is certified.
+# The loop is varied and the conditions are evaluated again. A search varies one value in steps until the loop becomes
+# certified or uncertified, and narrows the last step down to this edge. A search can miss an uncertified interval that
+# is narrower than a step. The value that it returns is certified.
 
 
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
 
-#: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond those of any device.
+#: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device's values.
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
-_SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside it is smaller; else the ratio may jump.
+_SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; larger ones may be a jump.
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
 
 
 def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
-    """Return the largest certified value that steps from `most` down to `least` find, or None."""
+    """Return the largest certified value, searched in steps from `most` down to `least`, or None."""
     outside = most
     while outside > least:
         inside = outside / _STEP
@@ -276,7 +276,7 @@ class Help:
 
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> list[Help]:
-    """Return single changes that certify the coupling or lower its requirement `needs` by over 10 %."""
+    """Return single changes that certify the coupling or lower its requirement `needs` by more than 10 %."""
     if needs.certified or condition.not_varied(loop):
         return []
     candidates = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
@@ -310,7 +310,10 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> Help:
-    """Return the change with the largest factor that certifies, rounded down to 0.001, else of least requirement."""
+    """Return the change by the largest factor that certifies, rounded down to 0.001.
+
+    If no factor certifies, return the change with the least requirement.
+    """
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
@@ -332,7 +335,7 @@ class Margins:
 
 @dataclass(frozen=True)
 class Audit:
-    """The assessment of a coupling with its margins, and changes that help if a condition is not certified."""
+    """The assessment of a coupling with its margins, and changes that help to satisfy a condition that fails."""
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
@@ -350,7 +353,7 @@ def audit(
     seed: int = 0,
     progress: Progress = lambda done, total: None,
 ) -> Audit:
-    """Assess a coupling, with its margins to the edge of each condition.
+    """Return the assessment of a coupling, its margins to the edge of each condition, and changes that would help.
 
     Args:
         loop: The loop, with the range of switching delays, if any.

@@ -28,10 +28,10 @@ from haptic_loop.design.result import RANGES, listed
 # ----------------------------------------------------------------------------------------------------
 # An export is one state-space block with a fixed order of its sums, and a test vector in that order.
 #
-# A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision. It starts at 0.0
-# and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, .. Every language
-# can keep this order, so that an exported block repeats its test vector to the last bit. In single precision
-# coefficients, inputs and every operation are rounded to 24 bits.
+# A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision. The sum starts at
+# 0.0 and adds one rounded product after another: first those of the states z_0, z_1, .., then those of the inputs
+# u_0, u_1, .. Every language can keep this order, so that an exported block repeats its test vector to the last bit. In
+# single precision, coefficients, inputs and every operation are rounded to 24 bits.
 #
 # If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, where q are
 # the unlimited forces, f the limited forces and e the slips. The tick makes the first wrong limit active or inactive
@@ -48,7 +48,7 @@ from haptic_loop.design.result import RANGES, listed
 _TICKS = 64  # length of a test vector, longer than the fast modes and the usual delays of a loop
 _MOST_TURNS = 100_000  # largest number of switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
-_RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, unless rounding is larger
+_RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, unless its rounding error is larger
 _BALL_ROUNDING = 16  # allowed rounding of a block's residual, in epsilons times the largest row sum of absolute terms
 _MOST_STEPS = 1000  # largest number of steps for force vectors; 5 are usual, random well-conditioned M took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
@@ -77,7 +77,7 @@ class ExportedBlock:
     input: _Signal
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
-    limiter: Limiter | None = None  # None: no limiter. With one, `system` is the block while no force is limited.
+    limiter: Limiter | None = None  # None without one; otherwise `system` is the block while no force is limited
     single: tuple[float, float] | None = None  # single precision: its largest error, and the largest output
 
     @property
@@ -94,7 +94,7 @@ class _Trial:
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """Return the block V(z) from forces to displacements. Raises ValueError for a coupling without a V around Psi E."""
+    """Return the block V(z) from forces to displacements. Raises ValueError for a coupling without a V(z)."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         reason = "this coupling has no V(z) in feedback around the environment; export its process with --process"
@@ -164,7 +164,7 @@ def _with_a_state(system: Lti) -> Lti:
 def trial(block: ExportedBlock) -> _Trial:
     """Return normally distributed random inputs and their outputs.
 
-    For a limiter, inputs are scaled so that forces without it would exceed a limit on a third of the ticks.
+    For a limiter, inputs are scaled so that unlimited forces would exceed a limit on a third of the ticks.
     """
     rng = np.random.default_rng(0)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
@@ -226,7 +226,7 @@ def _box_matrix(limiter: Limiter) -> Array:
 
 
 def _turns(m: int) -> int:
-    """Return the largest number of switches in a box problem: 3^m, which always suffices, or _MOST_TURNS if less."""
+    """Return the largest number of switches in a box problem: 3^m, which always suffices, but at most _MOST_TURNS."""
     return min(3**m, _MOST_TURNS)
 
 

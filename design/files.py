@@ -37,7 +37,7 @@ _MOST_STORED = 50_000_000  # of a stored coupling; a proof over 200 states takes
 _MOST_UNPACKED = 4_000_000_000  # of an unpacked trace; ten hours of two channels take 3e9
 _MOST_WORDS = 1000  # of one message
 
-_DEEPEST_KEY = 20  # largest number of names joined by dots, because tomllib's time and memory grow with its square
+_DEEPEST_KEY = 20  # most names joined by dots in a key; tomllib's time and memory grow with the square of their number
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{_DEEPEST_KEY}}}")
 
@@ -85,7 +85,7 @@ _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
 
 @contextmanager
 def one_command() -> Iterator[None]:
-    """Begin a new record of the files that a command reads and writes. At its end remove new folders without files."""
+    """Begin a new record of the files that a command reads and writes. After the command, remove new empty folders."""
     token = _ledger.set(ledger := _Ledger())
     try:
         yield
@@ -125,6 +125,7 @@ def _refusing(what: str, hint: str = "") -> Iterator[None]:
 
 
 def _met(places: set[Any], known: dict[Any, str]) -> str | None:
+    """Return the name of the file in `known` that is at one of the places, or None."""
     return next((known[place] for place in places if place in known), None)
 
 

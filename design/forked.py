@@ -22,8 +22,8 @@ from typing import Any, Generic, NoReturn, TypeVar
 
 _Result = TypeVar("_Result")
 
-#: Whether second processes are allowed: in a command that has its process for itself, and loads no user's own code.
-#: Other code may print, write files, or have threads whose locks a copy of the process would inherit.
+#: Whether second processes are allowed. They are allowed in a command that has its process for itself and loads no code
+#: of the user. Other code may print, write files, or have threads whose locks a copy of the process would inherit.
 allowed = False
 
 _PR_SET_PDEATHSIG = 1  # number of an operation of Linux's prctl
@@ -52,7 +52,7 @@ class Forked(Generic[_Result]):
         # The second process must not handle Ctrl-C or SIGTERM as a command does.
         handled = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
         try:
-            with warnings.catch_warnings():  # From Python 3.12 on, a fork beside a thread, as of a progress bar, warns.
+            with warnings.catch_warnings():  # Python 3.12 warns of a fork while a thread runs, here of a progress bar.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 self._process = os.fork()
             if not self._process:
