@@ -18,7 +18,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design.assessment import Assessment, check_ranges
 from haptic_loop.design.certificate import judged, limiter_rho, named, prove, requirements_of
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
+from haptic_loop.design.coupling_file import Certificate, Stored, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.known_device import KNOWN_DEVICE
@@ -253,7 +253,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
     """
     limited = limiter if named(design.required_condition).extensible else None
     for certificate in (limited, design.certificate):
-        if certificate and certificate.scenario == digest(loop, design.coupling.form()):
+        if certificate and certificate.is_for(loop, design.coupling):
             return certificate, None
     try:
         return _certificate(loop, design), None

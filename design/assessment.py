@@ -38,7 +38,7 @@ from haptic_loop.design.certificate import (
     requirements_of,
 )
 from haptic_loop.design.conditions import Condition, encoder_friction
-from haptic_loop.design.coupling_file import Certificate, digest
+from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import (
     ANY_ENVIRONMENT,
     LIMITER,
@@ -668,7 +668,7 @@ def assess(
     if isinstance(coupling, Chosen):
         proof, limiter_proof, limiter_c = coupling.certificate, coupling.limiter, coupling.c
         certificate, condition = certificate or proof, condition or coupling.required_condition
-        if proof and proof.scenario == digest(loop, coupling.coupling.form()):
+        if proof and proof.is_for(loop, coupling.coupling):
             searched = coupling.searched  # The search is for this loop only if the proof is.
         coupling = coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")

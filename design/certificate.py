@@ -291,7 +291,7 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
     The certificate is verified unless this process has proved or verified it before. `condition` is needed for a user's
     own condition.
     """
-    if certificate.scenario != digest(loop, coupling.form()):
+    if not certificate.is_for(loop, coupling):
         return False
     if certificate.seal in _made and sealed(certificate).seal == certificate.seal:
         return True
@@ -368,7 +368,7 @@ def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Cer
     loop and coupling, the exact proof is not repeated. Raises NotProved if the certificate does not hold in the loop,
     or if the proof would take minutes.
     """
-    is_proved = known is certificate and certificate.scenario == digest(loop, coupling.form())
+    is_proved = known is certificate and certificate.is_for(loop, coupling)
     try:
         condition = condition_of(certificate)
     except ValueError as error:
@@ -523,7 +523,7 @@ def requirements_of(
     """
     loop = loop.at(loop.environment).switching(None)
     conditions = (*conditions_of(loop), *([named(own)] if own else []))
-    proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
+    proved = known.condition if known and known.is_for(loop, coupling) else None
 
     requirements = {each.name: each.judge(loop, coupling) for each in conditions}
     with within(budgets.EXACT):  # one budget for all proofs

@@ -49,6 +49,10 @@ class Certificate(Strict, frozen=True):
         """The certificate itself if limited forces are among its facts, else None."""
         return self if "limiter" in self.facts else None
 
+    def is_for(self, loop: Loop, coupling: Coupling) -> bool:
+        """Return whether the certificate was made for exactly this loop and coupling."""
+        return self.scenario == digest(loop, coupling.form())
+
 
 class Stored(Strict, frozen=True):
     """A coupling with its loop and, once it is proved, its certificate."""
@@ -63,6 +67,7 @@ class Stored(Strict, frozen=True):
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
+        """Return the record to store. Raises ValueError for a wrong number of channels or a form of another system."""
         stored = cls(loop, coupling.form(), certificate)
         filed(loop, coupling)
         return stored
@@ -101,7 +106,7 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
 def digest(*parts: msgspec.Struct) -> str:
     """Return the SHA-256 of the parts' canonical JSON: sorted keys, shortest decimals, floats with a point.
 
-    An environment of a user's own class counts with the matrices of its E(z), because its fields need not determine E.
+    The matrices of E(z) are included for an environment of a user's own class, whose fields need not determine E.
     """
     loops = [part for part in parts if isinstance(part, Loop)]
     own = [loop.E() for loop in loops if not isinstance(loop.environment, Network | RigidWall)]
