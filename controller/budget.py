@@ -162,7 +162,7 @@ class EnergyBudget(_Net):
             nsim: The number of simulations.
 
         Raises:
-            ValueError: A number is out of range.
+            ValueError: W0, the cap, T or a damping is out of range.
         """
         super().__init__(start, cap, nsim)
         delta = np.array(delta, dtype=float)
@@ -172,17 +172,9 @@ class EnergyBudget(_Net):
             encoder_step = np.abs(self._axes.T) @ np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
         lo, hold = np.array(packets.lo, dtype=np.int64), packets.hold
         oldest = (lo if packets.hi is None else np.array(packets.hi, dtype=np.int64)) + hold
-        if delta.ndim != 1 or lo.shape != delta.shape or oldest.shape != delta.shape:
-            shapes = f"{delta.shape}, {lo.shape} and {oldest.shape}"
-            raise ValueError(f"delta, lo and hi have the shapes {shapes}, expected one number per channel each")
         if not ((delta > 0) & (delta < np.inf)).all() or not 0 < T < np.inf:
             raise ValueError(f"delta is {delta.tolist()} and T is {T:g}, expected positive numbers")
-        if hold < 0 or not ((lo >= 0) & (lo <= oldest - hold)).all():
-            span = f"{lo.tolist()} to {(oldest - hold).tolist()} samples, held for {hold} more"
-            raise ValueError(f"delays are {span}, expected 0 <= lo <= hi and hold >= 0")
         steps = np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
-        if not ((steps >= 0) & (steps < np.inf)).all():
-            raise ValueError(f"encoder_step is {steps.tolist()}, expected steps >= 0 in m")
         damping = (1 - EPS) * delta[:, None]
         self._step, self._coarse = steps[:, None], bool(steps.any())
         self._damping, self._square = damping / T, T / (4 * damping)  # coefficients of dx^2 and of a^2

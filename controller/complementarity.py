@@ -81,7 +81,6 @@ class BoxProblem(_Problem):
 
     Raises:
         SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.
-        ValueError: A lower limit is not below its upper limit.
     """
 
     lower: Array  # (n,) -inf without a limit
@@ -91,8 +90,6 @@ class BoxProblem(_Problem):
         object.__setattr__(self, "M", frozen(self.M, 2))
         for name in ("lower", "upper"):
             object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
-        if not (self.lower < self.upper).all():
-            raise ValueError(f"limits are {self.lower.tolist()} to {self.upper.tolist()}, expected lower < upper")
         _ = self.regular
 
     def solve(self, q: Array) -> tuple[Array, Array]:

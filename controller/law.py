@@ -265,9 +265,6 @@ class Limiter(Law):
             raise ValueError(f"limit is {self.limit.tolist()}, expected positive forces in N")
         if not ((self.rho >= 0) & (self.rho < np.inf)).all():
             raise ValueError(f"rho is {self.rho.tolist()}, expected stiffnesses >= 0 in N/m")
-        for ball in self.balls:
-            if len(set(self.limit[ball].tolist())) != 1:
-                raise ValueError(f"limit is {self.limit.tolist()}, expected one value for all axes of a vector")
         if self.balls and self.walls:
             raise ValueError("walls cannot be combined with forces that are limited as vectors: limit each axis")
         _ = self.problem

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.budget import NetFigures
-from haptic_loop.controller.delay import HeldLine, Ticks, packet_delays
+from haptic_loop.controller.delay import HeldLine, Ticks
 from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.law import Law, Transition
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
@@ -68,18 +68,11 @@ class Process(ReadOnly):
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
-            value = frozen(getattr(self, name), 1, name)
-            object.__setattr__(self, name, value)
-            if value.shape != (self.channels,):
-                raise ValueError(f"{name} has {value.size} entries for {self.channels} channels")
-        if not (self.force_limit > 0).all():
-            raise ValueError(f"force_limit is {self.force_limit.tolist()}, expected positive forces in N")
-        if not ((self.encoder_step >= 0) & (self.encoder_step < np.inf)).all():
-            raise ValueError(f"encoder_step is {self.encoder_step.tolist()}, expected steps >= 0 in m")
+            object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
         if self.delays is not None:
-            object.__setattr__(self, "delays", packet_delays(self.delays))
-            if self.delays.shape[1] != self.channels:
-                raise ValueError(f"delays have {self.delays.shape[1]} channels, expected {self.channels}")
+            delays = np.array(self.delays, dtype=np.int64)
+            delays.setflags(write=False)
+            object.__setattr__(self, "delays", delays)
 
     @cached_property
     def ticked(self) -> Law:
@@ -157,8 +150,6 @@ class StepBuffer:
         transition: Transition | None = None,  # None: that of the process's law
     ) -> None:
         nz, m = process.F.order, process.channels
-        if plant_states < m:
-            raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
         self.ticks = ticks
         self.process = process
         width = nz + plant_states + outside + m

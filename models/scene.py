@@ -341,18 +341,12 @@ def _placed(
         base = _joints(body[i], device) if i in body else ()
         placed.append(_place(port, (*handles[i - 1], *own), base, f"link_{i}"))
     for p, (holds, port) in enumerate(held, start=1):
-        extra = port.mass.shape[-1] - len(holds)
-        if port.handles != len(holds) or extra < 1:
-            raise ValueError(
-                f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)} and at least 1"
-            )
         first = devices[holds[0] - 1]
         if any(devices[i - 1].axis_names != first.axis_names for i in holds):
             raise ValueError(f"person #{p}.holds is {list(holds)}: expected devices with the same free axes")
         port = port.in_space(len(first.free))
-        own = (joint for j in range(1, extra) for joint in _joints(f"body_{p}_{j}", first))
         hands = (joint for i in holds for joint in handles[i - 1])
-        placed.append(_place(port, (*hands, *own, *_joints(f"body_{p}", first)), (), f"cross_{p}"))
+        placed.append(_place(port, (*hands, *_joints(f"body_{p}", first)), (), f"cross_{p}"))
     return tuple(placed)
 
 
@@ -633,18 +627,7 @@ class Crowd:
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
-        count = 1 + 2 * max(self.axes, default=1) ** 2
-        if links.ndim != 4 or links.shape[-1] != count or 0 in links.shape[1:]:
-            raise ValueError(f"links has the shape {links.shape}, expected (sets, devices, links, {count})")
-        if not ((links >= 0) & (links < np.inf)).all():
-            raise ValueError("links has a negative or infinite entry, expected finite numbers >= 0")
         bodies = np.array(self.bodies, dtype=float) if self.holds else np.zeros((len(links), 0, 5))
-        if bodies.shape != (len(links), len(self.holds), 5):
-            raise ValueError(f"bodies has the shape {bodies.shape}, expected {(len(links), len(self.holds), 5)}")
-        if not ((bodies >= 0) & (bodies < np.inf)).all() or not (bodies[..., 0] > 0).all():
-            raise ValueError(
-                "bodies: expected finite numbers that are not negative, and a positive mass for each person"
-            )
         for name, values in (("links", links), ("bodies", bodies)):
             values.setflags(write=False)
             object.__setattr__(self, name, values)

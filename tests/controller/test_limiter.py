@@ -319,8 +319,3 @@ def test_bad_limits_are_named():
             Limiter(G, (0, 0), limit=np.ones(2), rho=np.array([1.0, rho]))
     with pytest.raises(ValueError, match="a block of 2 x 2 cannot serve 3 channels"):
         Limiter(G, (0, 0, 0), limit=np.ones(3), rho=np.ones(3))
-
-
-def test_upper_limits_exceed_lower_ones():
-    with pytest.raises(ValueError, match="expected lower < upper"):
-        BoxProblem(np.eye(2), np.zeros(2), np.array([1.0, 0.0]))

@@ -174,12 +174,6 @@ def test_stiff_and_defective_responses_match_plain_solves(make, summed):
     np.testing.assert_allclose(G.at(w), expected, atol=1e-9 * np.abs(expected).max(), rtol=0)
 
 
-@pytest.mark.parametrize("steps", [(-1,), (1.5,)])
-def test_a_delay_is_a_whole_number(steps):
-    with pytest.raises(ValueError, match="whole number of samples"):
-        delay(steps, 1e-3)
-
-
 def test_singular_algebraic_loop_is_refused():
     G, H = Lti.constant([[2.0]], 1e-3), Lti.constant([[-0.5]], 1e-3)
     with pytest.raises(SingularLoop, match="algebraic loop"):

@@ -131,29 +131,11 @@ def test_encoders_do_not_move_the_device():
         (lambda: SpringDamper([0.0], [1.0]), "expected positive stiffnesses"),
         (lambda: SpringDamper([1.0], [-1.0]), "expected dampings >= 0"),
         (lambda: Compliance(Lti.constant([[1.0]], T)).around(environment(FIGURE_4, T)), "has 2 contacts"),
-        (lambda: Process(Law(wall(1.0)), np.array([0.0]), NONE), "expected positive forces"),
-        (lambda: Process(Law(wall(1.0)), np.array([1.0]), np.array([-1.0])), "expected steps >= 0"),
-        (lambda: Process(Law(wall(1.0)), np.array([1.0, 1.0]), NONE), "2 entries for 1 channels"),
-        (lambda: StepBuffer(process(wall(1.0)), 1, 0), "must be the positions"),
     ],
 )
-def test_impossible_couplings_and_processes_are_refused(build, message):
+def test_impossible_couplings_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
-
-
-def test_delays_cover_every_channel():
-    F, free = Lti.constant(np.eye(2), 1e-3), (np.full(2, np.inf), np.zeros(2))
-    delays = np.ones((5, 2, 1), dtype=int)
-    assert Process(Law(F), *free, delays=delays).delays.shape == (5, 2, 1)
-    with pytest.raises(ValueError, match="delays have 1 channels, expected 2"):
-        Process(Law(F), *free, delays=delays[:, :1])
-
-
-def test_encoder_steps_are_finite_and_not_negative():
-    for step in (np.inf, np.nan, -1e-6):
-        with pytest.raises(ValueError, match="encoder_step"):
-            process(wall(1000.0), step=step)
 
 
 def test_passivity_layers_count_ticks_of_the_run():

@@ -5,7 +5,7 @@ import pytest
 from shared import FIGURE_4, force_map
 
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising
+from haptic_loop.controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, realising
 from haptic_loop.controller.environment import environment
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.tick import Process, StepBuffer
@@ -17,7 +17,7 @@ NO_LIMIT = np.full(2, np.inf)
 
 
 def column(*delays):
-    return packet_delays(np.array(delays)[:, None, None])
+    return np.array(delays)[:, None, None]
 
 
 def carried(delays, forces):
@@ -139,15 +139,3 @@ def test_impossible_ranges_are_refused(fields, message):
 def test_patterns_of_the_loop_need_its_delays(pattern):
     with pytest.raises(ValueError, match="give its delays"):
         VaryingDelay((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
-
-
-def test_a_process_refuses_delays_that_do_not_fit():
-    G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
-    with pytest.raises(ValueError, match="1 channels, expected 2"):
-        Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
-    with pytest.raises(ValueError, match="delays have fractions"):
-        Process(Law(G), NO_LIMIT, IDEAL, delays=np.full((5, 2, 1), 1.7))
-    buffer = StepBuffer(Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
-    buffer.tick(0)
-    with pytest.raises(ValueError, match="given for 1 ticks"):
-        buffer.tick(1)

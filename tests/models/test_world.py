@@ -120,13 +120,6 @@ def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
     assert port.unsettled == 0
 
 
-def test_limits_within_a_ball_must_be_equal(tmp_path):
-    text = f'<mujoco><worldbody><body name="tip">{FREE}</body></worldbody></mujoco>'
-    scene = world(tmp_path, text, ["tip"], [np.eye(2) * 500], along=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    with pytest.raises(ValueError, match="expected one for its length"):
-        scene.port([3.0, 4.0], [slice(0, 2)])
-
-
 def test_a_slow_scene_stands_still_between_its_steps(tmp_path):
     port = world(tmp_path, LINE, every=4).port()
     assert port.world.h == 4 * T

@@ -17,7 +17,6 @@ from haptic_loop import certify, design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.budget import EnergyBudget, Packets
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
-from haptic_loop.controller.delay import packet_delays
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, idle, netted
@@ -143,7 +142,7 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
         delays = np.where(rng.random(delays.shape) < 0.05, -1, delays)
         delays[500:530] = -1  # a gap so long that the device must stop holding its force
         simulation = replace(assemble(scenario, coupling), scenario=scenario)
-        simulation = replace(simulation, process=replace(simulation.process, delays=packet_delays(delays[:, :, None])))
+        simulation = replace(simulation, process=replace(simulation.process, delays=delays[:, :, None]))
     guarded = netted(simulation, EnergyNet(start))
     trace = run(guarded, "exact")
     part = trace.net.figures()

@@ -16,7 +16,7 @@ from haptic_loop import load
 from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
-from haptic_loop.controller.delay import Periods, Timing, VaryingDelay
+from haptic_loop.controller.delay import Periods, VaryingDelay
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.design.certificate import required_damping
 from haptic_loop.design.coupling_file import Stored, save
@@ -152,11 +152,6 @@ def test_drawn_tick_times_are_in_range_and_seeded():
 def test_impossible_tick_times_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         PAIR.replace(**changes)
-
-
-def test_forces_latch_within_their_tick():
-    with pytest.raises(ValueError, match="below the period"):
-        Timing(np.array([1e-3]), np.array([[1e-3]]))
 
 
 @pytest.mark.slow

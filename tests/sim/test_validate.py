@@ -499,17 +499,6 @@ def test_bad_human_files_are_refused(text, message, tmp_path):
         run_command.main(["--human", str(tmp_path / "h.toml"), "--out", str(tmp_path)])
 
 
-def test_impossible_crowds_cannot_be_built():
-    with pytest.raises(ValueError, match="negative or infinite entry"):
-        Crowd(-np.ones((1, 2, 1, 3)))
-    with pytest.raises(ValueError, match="expected \\(sets, devices, links, 3\\)"):
-        Crowd(np.ones((2, 3)))
-    with pytest.raises(ValueError, match="bodies has the shape"):
-        Crowd(np.ones((1, 2, 1, 3)), ((1, 2),))
-    with pytest.raises(ValueError, match="a positive mass for each person"):
-        Crowd(np.ones((1, 2, 1, 3)), ((1, 2),), np.zeros((1, 1, 5)))
-
-
 class OwnEngine(ExactEngine):
     """The exact engine of one simulation, as a user would write it."""
 
