@@ -73,14 +73,14 @@ def judge(
     return Demands(F, requirements, demands)
 
 
-def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
+def grid(loop: Loop, couplings: Sequence[Demands]) -> Array:
     """Return frequencies [Hz] up to 1/(2 T), dense around poles, with FEEL_HZ and the binding frequencies."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
-    even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
+    even = frequencies(*systems, low=_LOWEST_HZ * per_hz, high=np.pi, points=200) / per_hz
     binding = [r.frequency_hz for judged in couplings for r in judged.requirements.values()]
     shown = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
-    return np.unique([*even, *(hz for hz in shown if low_hz <= hz <= even[-1])])
+    return np.unique([*even, *(hz for hz in shown if _LOWEST_HZ <= hz <= even[-1])])
 
 
 def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:

@@ -422,15 +422,13 @@ _ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map wi
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
     """Return the requirement of this-environment, with constant delays and touching walls, for each of the members."""
-    return [_in_one(loop, coupling, member) for member in members]
-
-
-def _in_one(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
-    try:
-        F = loop.at(member.network).F(coupling)
-    except SingularLoop as error:
-        return refusal("this-environment", loop.delta, str(error))
-    return this_environment(F, loop)
+    requirements = []
+    for member in members:
+        try:
+            requirements.append(this_environment(loop.at(member.network).F(coupling), loop))
+        except SingularLoop as error:
+            requirements.append(refusal("this-environment", loop.delta, str(error)))
+    return requirements
 
 
 def worst(requirements: Sequence[Requirement]) -> int:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import spend
-from haptic_loop.controller.lti import Array, Lti, frozen
+from haptic_loop.controller.lti import Array, Lti
 
 _ERROR = 1e-6  # allowed relative error of an integral
 _HALVINGS, _HALVED = (
@@ -137,17 +136,12 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     width = np.maximum(1 - np.abs(poles), 1e-9)
     around = (np.abs(np.angle(poles))[:, None] + width[:, None] * _OFFSETS).ravel()
     # np.unique would import numpy.ma, which takes 6 ms.
-    grid = np.sort(np.concatenate([_spaced(low, high, points), around]))
+    grid = np.sort(np.concatenate([np.linspace(low, high, points), np.geomspace(low, high, points), around]))
     return grid[(grid >= low) & (grid <= high) & np.append(True, grid[1:] != grid[:-1])]
 
 
 _OFFSETS = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
 _OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # distances of frequencies from that of a pole, in widths of the pole
-
-
-@lru_cache(maxsize=64)
-def _spaced(low: float, high: float, points: int) -> Array:
-    return frozen(np.concatenate([np.linspace(low, high, points), np.geomspace(low, high, points)]), 1)
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:

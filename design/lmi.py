@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -84,17 +83,14 @@ def packed(n: int) -> int:
     return n * (n + 1) // 2
 
 
+_upper = cache(np.triu_indices)
+
+
 def symmetric_from(vector: Array, n: int) -> Array:
     """Return the symmetric (n, n) matrix whose upper triangle, row by row, is `vector`."""
     M, (rows, columns) = np.empty((n, n)), _upper(n)
     M[rows, columns] = M[columns, rows] = vector
     return M
-
-
-@lru_cache(maxsize=64)
-def _upper(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the row and the column of every entry in the upper triangle of an (n, n) matrix, in row order."""
-    return np.triu_indices(n)
 
 
 # ----------------------------------------------------------------------------------------------------
