@@ -1,10 +1,12 @@
-"""Evaluate conditions for a transfer matrix and data of a loop, and read the requirements in a command's JSON.
+"""Evaluate conditions for a transfer matrix and data of a loop, and read the reports of commands.
 
 F is the force map, G the map before the delays Theta, V the coupling; lo and hi are the ends of switching delays
 [samples].
 """
 
 from __future__ import annotations
+
+import json
 
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -89,6 +91,12 @@ def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
 def summed(demand):
     """Return the block of a demand, which must be positive real: its free part and that of the damping."""
     return demand.free + demand.gain
+
+
+def reported(main, folder, *options):
+    """Run a command, and return its exit code and the report that it writes into the folder."""
+    code = main([*options, "--json", str(folder / "r.json")])
+    return code, json.loads((folder / "r.json").read_text())
 
 
 def decisive(report):

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from evaluate import reported
 
 from haptic_loop.cli.compare import _beside, _nearest, main
 from haptic_loop.cli.run import main as run_once
@@ -14,8 +15,7 @@ from haptic_loop.sim.scenario import InputError
 
 
 def compare(tmp_path, *options):
-    assert main([*options, "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]) == 0
-    return json.loads((tmp_path / "r.json").read_text())["alternatives"]
+    return reported(main, tmp_path, *options, "--out", str(tmp_path / "out"))[1]["alternatives"]
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import forked
 import msgspec
 import numpy as np
 import pytest
+from evaluate import reported
 from messages import says
 
 from haptic_loop.cli.options import name_of, place
@@ -35,8 +36,7 @@ SECTIONS = {"case", "scenario", "assessment", "stability", "run", "error", "file
 
 
 def run(tmp_path, *options):
-    code = main([*options, "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")])
-    return code, json.loads((tmp_path / "r.json").read_text())
+    return reported(main, tmp_path, *options, "--out", str(tmp_path / "out"))
 
 
 def test_case_none_reproduces_figure_5(tmp_path):

@@ -1,12 +1,10 @@
 """Walls solve a complementarity problem in each tick, return at most the stored energy, and are certified in loops."""
 
-import json
-
 import msgspec
 import numpy as np
 import pytest
 from driven import drive, wander
-from evaluate import this_environment
+from evaluate import reported, this_environment
 from messages import says
 from scipy.optimize import brentq
 from shared import FIGURE_4, SOFT, force_map, loop_of
@@ -237,9 +235,8 @@ def test_both_engines_see_the_same_contacts():
 @pytest.mark.slow
 def test_a_run_reports_contact_and_its_certificate(tmp_path):
     def run(*options):
-        main(["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot", *options,
-              "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
-        return json.loads((tmp_path / "r.json").read_text())
+        quick = ["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot"]
+        return reported(main, tmp_path, *quick, *options, "--out", str(tmp_path))[1]
 
     soft, bare = run(), run("--case", "none")
     assert safe_with(soft) == ANY

@@ -1,10 +1,10 @@
 """Tests of an assessment's guarantee: which loops, couplings and forces it covers, and which changes end it."""
 
-import json
 from functools import cache
 
 import msgspec
 import pytest
+from evaluate import reported
 from shared import ONE_MASS
 
 from haptic_loop.cli.audit import main as audit
@@ -327,19 +327,7 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
     main, words, elsewhere = _COMMANDS[name]
 
     def report(*more):
-        main(
-            [
-                *words,
-                *more,
-                "--scenario",
-                "one.toml",
-                "--json",
-                str(tmp_path / "r.json"),
-                "--out",
-                str(tmp_path / "out"),
-            ]
-        )
-        return json.loads((tmp_path / "r.json").read_text())
+        return reported(main, tmp_path, *words, *more, "--scenario", "one.toml", "--out", str(tmp_path / "out"))[1]
 
     assert safe_with(report()) == HERE
     there = report(*elsewhere)
@@ -362,15 +350,13 @@ def test_commands_agree_on_the_requirement_of_a_wall(tmp_path, monkeypatch, ever
     frozen = [required_damping(state, coupling, "this-environment").required[0] for state in loop.frozen()]
     assert expected[0] > 1.01 * max(frozen)
     save(Stored.of(loop, coupling), "wall.json")
-    words = ["--scenario", "one-wall", "--coupling", "wall.json", "--json", "r.json", "--out", "out"]
+    words = ["--scenario", "one-wall", "--coupling", "wall.json", "--out", "out"]
     quick = ["--duration", "0.1", "--no-plot"]
     for command, more in ((run, quick), (validate, [*quick, "--humans", "2"]), (audit, []))[: 3 if every else 2]:
-        command([*words, *more])
-        report = json.loads((tmp_path / "r.json").read_text())
+        _, report = reported(command, tmp_path, *words, *more)
         assert needs(report, "this-environment")["required_damping"] == pytest.approx(expected, rel=1e-9)
     if every:
-        compare([*words, "--no-plot"])
-        (compared,) = json.loads((tmp_path / "r.json").read_text())["couplings"]
+        (compared,) = reported(compare, tmp_path, *words, "--no-plot")[1]["couplings"]
         assert needs(compared, "this-environment")["required_damping"] == pytest.approx(expected, rel=1e-9)
     judged = comparison.judge(loop, coupling)
     assert judged.requirements["this-environment"].required == pytest.approx(expected, rel=1e-9)

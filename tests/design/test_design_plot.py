@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from evaluate import reported
 from shared import FIGURE_4, PAIR, SOFT, at_springs
 
 from haptic_loop.cli.compare import main
@@ -157,9 +158,8 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
 def test_delays_turn_the_phase_of_each_curve(tmp_path):
     """Without a coupling device i feels z^-n of the ideal E_ii for its delay of n samples; --no-plot draws nothing."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
-    assert main([*args, "--json", str(tmp_path / "r.json")]) == 0
+    _, outcome = reported(main, tmp_path, *args)
     assert not list(tmp_path.glob("*.png"))
-    outcome = json.loads((tmp_path / "r.json").read_text())
     w = 2 * np.pi * np.array(outcome["frequency_hz"])[:, None]
 
     def felt(curves):

@@ -7,6 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
+from evaluate import reported
 from shared import FIGURE_4, ONE_MASS, environment_by_hand, filter_by_hand, force_map
 
 from haptic_loop.cli.audit import main as audit_main
@@ -334,22 +335,13 @@ def test_spring_dampers_may_be_proved_for_ranges():
 
 
 @pytest.mark.slow
-def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, capsys, monkeypatch):
+def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, monkeypatch):
     monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
-    file, report = tmp_path / "c.json", tmp_path / "r.json"
-    common = ["--scenario", str(scenario_file), "--json", str(report)]
-
-    def reported(main, *options) -> tuple[int, dict]:
-        code = main([*options])
-        capsys.readouterr()
-        return code, json.loads(report.read_text())
-
-    code, design = reported(design_main, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common)
-    assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (
-        0,
-        RANGES,
-        3,
+    file, common = tmp_path / "c.json", ["--scenario", str(scenario_file)]
+    code, design = reported(
+        design_main, tmp_path, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common
     )
+    assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (0, RANGES, 3)
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
@@ -357,43 +349,28 @@ def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, caps
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == RANGES
 
-    code, checked = reported(check_main, str(file), "--json", str(report))
+    code, checked = reported(check_main, tmp_path, str(file))
     assert (code, checked["guarantee"], checked["vertices"]) == (0, RANGES, 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
-    at_vertex = [
-        "--coupling",
-        str(file),
-        "--vertex",
-        "3",
-        "--engine",
-        "exact",
-        "--duration",
-        "0.2",
-        "--no-plot",
-    ]
-    code, run = reported(run_main, *at_vertex, *out)
+    at_vertex = ["--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "0.2", "--no-plot"]
+    code, run = reported(run_main, tmp_path, *at_vertex, *out)
     assert (code, safe_with(run)) == (0, RANGES)
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert not np.load(tmp_path / "out" / "trace.npz")["f"].any()  # The device touches nothing at this vertex.
 
 
 @pytest.mark.validate
-def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path, capsys):
+def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path):
     save(stored, tmp_path / "c.json")
-    file, report = tmp_path / "c.json", tmp_path / "r.json"
-    out = ["--scenario", str(scenario_file), "--json", str(report), "--out", str(tmp_path / "out")]
-
-    def reported(main, *options) -> tuple[int, dict]:
-        code = main([*options])
-        capsys.readouterr()
-        return code, json.loads(report.read_text())
-
-    code, audit = reported(audit_main, "--coupling", str(file), *out)
+    file, out = tmp_path / "c.json", ["--scenario", str(scenario_file), "--out", str(tmp_path / "out")]
+    code, audit = reported(audit_main, tmp_path, "--coupling", str(file), *out)
     assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, RANGES, True)
 
     quick = ["--humans", "6", "--engine", "exact", "--duration", "0", "--no-plot"]
-    code, validated = reported(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
+    code, validated = reported(
+        validate_main, tmp_path, "--coupling", str(file), "--environments", "ranges", *quick, *out
+    )
     assert (code, validated["certified"], validated["environments"]["count"]) == (0, True, 8)
     assert validated["unstable"]["exact"] == 0
     assert validated["worst"]["environment"] in validated["environments"]["names"]

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from evaluate import reported
 from messages import says
 from msgspec.structs import replace
 from shared import SOFT
@@ -87,8 +88,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
 
     loop = load().loop("I")
     design = design_coupling(loop)
-    assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
+    _, report = reported(design_command, tmp_path, "--out", str(tmp_path / "c.json"))
     assert assess(loop, design).guarantee.environments == safe_with(report) == HERE
     figures = transparency_of(loop, design)
     assert figures.mismatch_db == report["assessment"]["transparency"]["relative_mismatch_db"]
@@ -157,8 +157,7 @@ def test_engines_agree_on_a_run():
 def test_validate_equals_the_commands_verdict(tmp_path):
     findings = validate(load(), humans=20, engine="exact", duration=0, seed=3)
     options = ["--case", "none", "--humans", "20", "--engine", "exact", "--duration", "0", "--seed", "3", "--no-plot"]
-    assert validate_command([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
+    _, report = reported(validate_command, tmp_path, *options, "--out", str(tmp_path))
     assert report["unstable"]["exact"] == int((findings.exact > 0).sum()) > 0
     assert report["worst"]["spectral_radius"] == findings.radius.max()
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluate import reported
 from msgspec.structs import replace as change
 
 from haptic_loop.cli import run as run_command
@@ -164,9 +165,8 @@ def test_validation_fails_if_an_adversary_contradicts_a_certificate(tmp_path, mo
         adversary, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
     )
     options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
-    assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["certified"]
+    code, report = reported(main, tmp_path, *options, "--out", str(tmp_path))
+    assert (code, report["certified"]) == (1, True)
     assert not report["holds"]
 
 

@@ -3,13 +3,11 @@
 docs/theory.md defines rho, beta and c of the limiter.
 """
 
-import json
-
 import msgspec
 import numpy as np
 import pytest
 from driven import tick_by_tick
-from evaluate import prove_limiter
+from evaluate import prove_limiter, reported
 from shared import SOFT, STIFF
 
 from haptic_loop.cli.run import main
@@ -121,17 +119,9 @@ def test_simulate_limits_forces_unless_told_to_clip():
 @pytest.mark.slow
 def test_the_report_says_which_guarantee_holds(tmp_path):
     def report(*options) -> dict:
-        where = [
-            "--no-plot",
-            "--duration",
-            "1",
-            "--out",
-            str(tmp_path),
-            "--json",
-            str(tmp_path / "r.json"),
-        ]
-        assert main([*options, *where]) == 0
-        return json.loads((tmp_path / "r.json").read_text())
+        code, report = reported(main, tmp_path, *options, "--no-plot", "--duration", "1", "--out", str(tmp_path))
+        assert code == 0
+        return report
 
     anywhere = ("--case", "I", "--condition", "any-environment")
     covered = report(*anywhere)["assessment"]["force_limits"]

@@ -3,7 +3,6 @@
 The forms are a filter that covers limited forces, a filter behind a delayed environment (psi = 1) with a free mass, and
 a pair: Q and a model of the environment."""
 
-import json
 import shutil
 import subprocess
 from concurrent.futures import Executor, Future
@@ -13,6 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from evaluate import reported
 from shared import VERTICES_ONLY
 
 from haptic_loop.cli import export, run, validate
@@ -93,15 +93,12 @@ def test_coupling_files_prove_and_drive_the_process(file_of, form):
 @pytest.mark.parametrize("form", FORMS)
 def test_run_and_validate_take_couplings_of_each_form(file_of, form, tmp_path):
     _, name, path = file_of(form)
-    common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
-    options = [*common, "--duration", "0.2", "--out", str(tmp_path)]
-    assert run.main(options) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
+    common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--out", str(tmp_path)]
+    _, report = reported(run.main, tmp_path, *common, "--duration", "0.2")
     assert report["assessment"]["guarantee"]["environments"] == HERE
     assert report["robustness"]["percent"] == 10
     assert (report["assessment"]["force_limits"]["rho"] is not None) == (form == "filter")
-    assert validate.main([*common, "--humans", "6", "--duration", "0.1", "--out", str(tmp_path)]) == 0
-    batch = json.loads((tmp_path / "r.json").read_text())
+    _, batch = reported(validate.main, tmp_path, *common, "--humans", "6", "--duration", "0.1")
     assert (batch["unstable"], batch["holds"]) == ({"exact": 0, "mujoco": 0}, True)
 
 

@@ -4,13 +4,13 @@ W0 [J] is the initial value of the account W: the most that a budget or shell gi
 comment cover rounding.
 """
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 
 import msgspec
 import numpy as np
 import pytest
+from evaluate import reported
 from shared import checkered
 
 from haptic_loop import certify, design_coupling, load, simulate
@@ -198,17 +198,8 @@ def test_the_shell_bounds_a_users_environment():
 
 @pytest.mark.slow
 def test_reports_say_what_the_budget_did(tmp_path):
-    options = [
-        "--energy-budget",
-        "0,0.0005",
-        "--duration",
-        "1.5",
-        "--no-plot",
-        "--out",
-        str(tmp_path),
-    ]
-    assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
+    options = ["--energy-budget", "0,0.0005", "--duration", "1.5", "--no-plot", "--out", str(tmp_path)]
+    _, report = reported(run_command, tmp_path, *options)
     # The position error compares this run with a run of the exact engine. It is small only if both have the budget.
     assert report["error"]["position_relative_rms"] < 1e-6
     part = report["energy_budget"]

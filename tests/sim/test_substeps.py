@@ -1,9 +1,8 @@
 """Check by the one-period maps of engines that `default_substeps` picks enough substeps."""
 
-import json
-
 import numpy as np
 import pytest
+from evaluate import reported
 
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
@@ -118,22 +117,11 @@ def test_runs_use_and_report_default_substeps(tmp_path):
     path = tmp_path / "stiff.toml"
     text = (SCENARIOS / "omega-pair.toml").read_text()
     path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))
-    options = [
-        "--scenario",
-        str(path),
-        "--coupling",
-        "published",
-        "--duration",
-        "0.1",
-        "--no-plot",
-    ]
-    options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
+    options = ["--scenario", str(path), "--coupling", "published", "--duration", "0.1", "--no-plot"]
+    options += ["--out", str(tmp_path / "o")]
     stepped = [*options, "--integrator", "RK4"]
-    assert main(stepped) == 0
-    assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] == 26
-    assert main([*stepped, "--substeps", "8"]) == 0
-    assert "coarse" in json.loads((tmp_path / "r.json").read_text())["remarks"][0]
+    assert reported(main, tmp_path, *stepped)[1]["run"]["substeps"] == 26
+    assert "coarse" in reported(main, tmp_path, *stepped, "--substeps", "8")[1]["remarks"][0]
     with pytest.raises(InputError, match="--substeps 1: RK4 x 1: the mode at"):
         main([*stepped, "--substeps", "1"])
-    assert main([*options, "--engine", "exact"]) == 0
-    assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] is None
+    assert reported(main, tmp_path, *options, "--engine", "exact")[1]["run"]["substeps"] is None

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from evaluate import reported
 from scipy.linalg import expm
 from shared import SOFT, STIFF
 
@@ -141,16 +142,9 @@ def test_switching_depends_on_the_seed_only():
 
 
 def run(tmp_path, *options):
-    options = [
-        *options,
-        "--no-plot",
-        "--out",
-        str(tmp_path / "out"),
-        "--json",
-        str(tmp_path / "r.json"),
-    ]
-    assert main(options) == 0
-    return json.loads((tmp_path / "r.json").read_text())
+    code, report = reported(main, tmp_path, *options, "--no-plot", "--out", str(tmp_path / "out"))
+    assert code == 0
+    return report
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from math import factorial
 import numpy as np
 import pytest
 from driven import driven
+from evaluate import reported
 from msgspec.structs import replace as replace_fields
 
 from haptic_loop.cli import run as run_command
@@ -156,12 +157,11 @@ def test_the_worst_person_and_hands_replay(tmp_path):
     )
     (tmp_path / "s.toml").write_text(text)
     base = ["--scenario", str(tmp_path / "s.toml"), "--engine", "exact", "--duration", "0.5", "--no-plot"]
-    options = [*base, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
-    assert main([*options, "--humans", "30"]) == 0
-    worst = json.loads((tmp_path / "r.json").read_text())["worst"]
+    options = [*base, "--out", str(tmp_path)]
+    worst = reported(main, tmp_path, *options, "--humans", "30")[1]["worst"]
     assert worst["person"][0]["holds"] == [1, 2]
-    assert run_command.main([*options, "--human", str(tmp_path / "worst-human.toml")]) == 0
-    stability = json.loads((tmp_path / "r.json").read_text())["stability"]
+    _, report = reported(run_command.main, tmp_path, *options, "--human", str(tmp_path / "worst-human.toml"))
+    stability = report["stability"]
     assert stability["spectral_radius"] == pytest.approx(worst["spectral_radius"], abs=1e-12)
 
 
@@ -376,10 +376,8 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
     monkeypatch.setattr(examine_module, "_examine", interrupted)
     monkeypatch.setattr(examine_module, "_BATCH", 125)
     options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
-    assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["interrupted"]
-    assert report["humans"] == 125
+    code, report = reported(main, tmp_path, *options, "--out", str(tmp_path))
+    assert (code, report["interrupted"], report["humans"]) == (130, True, 125)
 
 
 @pytest.mark.slow
