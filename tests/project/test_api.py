@@ -293,7 +293,8 @@ def test_help_describes_every_result_field():
         *("Assessment", "Design", "Findings", "Guarantee", "Rehearsed", "Requirement", "Trace", "Transparency")
     }
     for kind in [*results, ForceLimits, RangesResult]:
-        described = dict(re.findall(r"^\s+(\w+): (.+)$", kind.__doc__.split("Attributes:")[1], re.MULTILINE))
+        pages = [re.split("Attributes.*:", one.__doc__)[1] for one in kind.__mro__ if is_dataclass(one)]
+        described = dict(re.findall(r"^\s+(\w+): (.+)$", "".join(pages), re.MULTILINE))
         assert set(described) == {field.name for field in fields(kind)}, kind
         for field in fields(kind):
             if "Array" in str(field.type):
