@@ -242,13 +242,25 @@ class Chosen:
 class Design(Chosen):
     """A coupling with its objective, and the requirement that was computed from the coupling alone.
 
-    Attributes, beside those of Chosen:
+    Attributes:
+        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
+        condition: The name of the condition that the coupling was designed for.
         figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
         objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
         hurried: Whether the time limit ended the search, so that more time may find a better coupling.
+        kind: The kind of the coupling in reports.
+        phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
+        certificate: The Certificate, if it was proved in this process.
+        limiter: The Certificate for limited forces, or None.
+        c: The multipliers of the limiter that the design found, one row per device, or None.
+        searched: The search between the vertices of ranges (design.worst_member.Searched), or None.
+        own: The user's own condition (design.conditions.Condition), or None.
+        switching: The range of delays [samples] in which any switching is proved, or None.
+        notes: Remarks on the origin of the coupling, for reports.
+        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, or None.
     """
 
     figure: str
