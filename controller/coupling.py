@@ -441,7 +441,7 @@ class ForceFilter(ReadOnly, Coupling):
 NO_PAIRS = np.zeros((0, 2))
 
 
-def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
+def basis(poles: Array, z: NDArray[np.complex128], pairs: Array) -> NDArray[np.complex128]:
     """Return the basis functions b_k(z) for n poles and p pairs, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
     b_0 = 1. A real pole a adds (1 - a)/(z - a). A pair adds the two functions (1 + b1 + b2) z/d and (1 + b1 + b2)/d

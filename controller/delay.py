@@ -28,6 +28,7 @@ from haptic_loop.controller.lti import Array, Lti, frozen, taps
 
 Ticks = NDArray[np.int64]
 
+MOST_SAMPLES = 1000  # [samples] longest delay of a channel; every sample adds a state
 LOST = -1  # the delay of a packet that never arrives
 
 
@@ -106,8 +107,6 @@ class HeldLine:
 
 _Pattern = Literal["constant", "random", "bursty", "adversarial", "recorded"]
 
-_LONGEST = 1000  # [samples] largest delay that a file may have
-
 
 class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Delays of the forces, between lo and hi [samples], for every packet and channel."""
@@ -126,8 +125,8 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             lengths = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
             raise ValueError(f"{lengths}: give one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
-            if not 0 <= lo <= hi <= _LONGEST or lo % 1 or hi % 1:
-                expected = f"expected whole numbers of samples, 0 <= lo <= hi <= {_LONGEST}"
+            if not 0 <= lo <= hi <= MOST_SAMPLES or lo % 1 or hi % 1:
+                expected = f"expected whole numbers of samples, 0 <= lo <= hi <= {MOST_SAMPLES}"
                 raise ValueError(f"varying_delay on channel {i + 1} is {lo} to {hi}, {expected}")
         if not 0 <= self.loss <= 1:
             raise ValueError(f"varying_delay.loss is {self.loss:g}, allowed are probabilities 0 to 1")
@@ -155,11 +154,8 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def steady(self) -> bool:
         """Whether the delay of each channel is constant, so that certificates for constant delays hold."""
-        return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
-
-    @property
-    def _gaps(self) -> bool:
-        return any(LOST in row for row in self.recorded)
+        lossless = self.loss == 0 and not any(LOST in row for row in self.recorded)
+        return lossless and (self.playout or self.pattern == "constant" or self.lo == self.hi)
 
     def draw(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None = None) -> Ticks:
         """Draw the delays (ticks, m) of the packets of one run, in samples or LOST.

@@ -21,14 +21,13 @@ from numpy.typing import ArrayLike
 
 from haptic_loop.controller.arithmetic import Number, numbers, positive_definite, rational
 from haptic_loop.controller.coupling import Coupling, Strict
-from haptic_loop.controller.delay import delay
+from haptic_loop.controller.delay import MOST_SAMPLES, delay
 from haptic_loop.controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.ranges import Member, Ranges, members
 from haptic_loop.controller.units import PositionUnit, in_unit
 
-MOST_SAMPLES = 1000  # [samples] longest delay of a channel; every sample adds a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
 _LEAST_DAMPING = 1e-12  # [N s/m] far below that of any device; the square of its inverse does not overflow

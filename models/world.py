@@ -466,11 +466,9 @@ class WorldPort:
         """Return the force of each contact (contacts,) relative to its limit."""
         share = np.abs(force) / self._limits
         most = np.maximum.reduceat(share, self._first)
-        return (
-            np.where(self._radial, np.sqrt(np.add.reduceat(share**2, self._first)), most)
-            if self._radial.any()
-            else most
-        )
+        if not self._radial.any():
+            return most
+        return np.where(self._radial, np.sqrt(np.add.reduceat(share**2, self._first)), most)
 
     def _within(self, force: Array) -> Array:
         """Return `force` (m,) [N] scaled or clipped to its limits."""

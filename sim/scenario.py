@@ -17,7 +17,7 @@ from typing import Any, Self, get_args
 import msgspec
 import numpy as np
 
-from haptic_loop.controller.delay import LOST, Periods, Timing, VaryingDelay, drawn
+from haptic_loop.controller.delay import LOST, MOST_SAMPLES, Periods, Timing, VaryingDelay, drawn
 from haptic_loop.controller.environment import (
     GROUND,
     RIGID_WALL,
@@ -27,7 +27,7 @@ from haptic_loop.controller.environment import (
     Spring,
     Wall,
 )
-from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop, check_shortest
+from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop, check_shortest
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.controller.units import PositionUnit, in_unit
@@ -40,7 +40,6 @@ CASES = ("none", "I", "II")  # no coupling, or the paper's case of the reference
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
-LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take about a second
 _MOST_CHANNELS = 32  # sim.run with 32 channels takes seconds, and a design tens of seconds
 _LONGEST_NAME = 200  # characters
@@ -118,7 +117,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         for name in ("theta", "psi", "lam"):
             value = getattr(self, name)
             for i, n in enumerate(value or (), start=1):
-                require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
+                require(f"{name} #{i}", n, 0, MOST_SAMPLES, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             each = f"theta {list(self.theta)} and psi {list(self.psi)} of the channels"
             many = f"{each} are {total} samples in all, allowed are {_MOST_DELAYS}"

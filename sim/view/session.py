@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import MOST_SAMPLES
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import StepBuffer, at_limit
 from haptic_loop.design.assessment import Assessment
@@ -35,7 +36,7 @@ from haptic_loop.models.scene import Plant, Scene
 from haptic_loop.sim.couplings import NAMES, assessed, choose
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run_block
-from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario, is_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.stability import Mode, worst_mode
 from haptic_loop.sim.view.drawn_object import object_of
 from haptic_loop.sim.world import START_J, InWorld, Late, WorldFigures, live
@@ -202,8 +203,8 @@ def _changed(prepared: PreparedLoop, event: Couple | _Delay) -> PreparedLoop:
         chosen = _choose(prepared.menu, prepared.scenario, event.name)
         return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
     delays = tuple(n + event.samples for n in getattr(prepared.scenario, event.which))
-    if not 0 <= min(delays) <= max(delays) <= LONGEST_DELAY:
-        raise InputError(f"{event.which} would be {list(delays)}, allowed are 0 to {LONGEST_DELAY} samples")
+    if not 0 <= min(delays) <= max(delays) <= MOST_SAMPLES:
+        raise InputError(f"{event.which} would be {list(delays)}, allowed are 0 to {MOST_SAMPLES} samples")
     scenario = prepared.scenario.replace(None, **{event.which: delays})
     return _prepare(prepared.menu, scenario, prepared.label, prepared.chosen)
 
