@@ -239,27 +239,14 @@ class _Access:
         one = (..., 0) if self.ctrl.ndim == 1 else ...
         states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
-        if timing:
-            return self._timed(buffer, timing, rows, inputs)
-        if self.kick and not self.move:
-            return self._by_both(rows, inputs)
+        if timing or (self.kick and not self.move):
+            return self._timed(buffer, timing or Timing(np.array([self.T]), None), rows, inputs)
         shaped = list(self._shaped(states))
         return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
     def _shaped(self, states: Array) -> Array:
         """Return a view of [q; v] in states (ticks, size, ..); each tick is shaped like `state`."""
         return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
-
-    def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
-        """Return a function that makes MuJoCo's steps between half steps of the impedances."""
-        ctrl, move_by, T = self.ctrl, self._move_by, self.T
-
-        def advance(k: int) -> None:
-            ctrl[...] = inputs[k]
-            rows[k + 1][...] = rows[k]
-            move_by(T, rows[k + 1])
-
-        return advance
 
     def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
         ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
