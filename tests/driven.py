@@ -54,7 +54,7 @@ def drive(process: Process, x: np.ndarray) -> StepBuffer:
     return buffer
 
 
-def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
+def random_walks(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
     """Return random walks of displacements (ticks, channels, nsim)."""
     return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * step
 

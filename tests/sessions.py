@@ -28,7 +28,7 @@ def rehearsal_of(scenario, couplings, *faults, recorder=None, settings=FAST, **o
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: couplings, faults, **options)
 
 
-def strike(rehearsal, *faults, board=0):
+def inject_faults(rehearsal, *faults, board=0):
     """Add faults, written as for --fault, to a device and its line, which have had none."""
     faults, cable = tuple(map(FaultInjection.parse, faults)), rehearsal._cables[board]
     cable.emulator._waiting = list(faults)

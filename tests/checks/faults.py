@@ -26,7 +26,7 @@ from haptic_loop.hw.session import FREE_SPEED, STRONGEST, USUAL_CAP, Said, Sessi
 from haptic_loop.models.human import Voluntary
 from haptic_loop.sim.scenario import Scenario, load
 from tests.causes import cause_of
-from tests.sessions import MovesAxes, strike
+from tests.sessions import MovesAxes, inject_faults
 
 _WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
 LATE = 0.595  # [s] from arming to a time before most faults
@@ -559,7 +559,7 @@ def begins_late(case: Fault) -> bool:
 
 def rehearse_late_case(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
     """Continue a rehearsal of `CASES[0]`, which has reached LATE, with the fault of a case that `begins_late`."""
-    strike(rehearsal, *case.faults)
+    inject_faults(rehearsal, *case.faults)
     rehearsal.actions = _actions(case, rehearsal)
     return _rehearsed(case, rehearsal)
 

@@ -47,14 +47,16 @@ def network(x, rng):
     return force
 
 
-def thief(x, rng):
+def along_velocity(x, rng):
     """Return a controller whose forces of 12 N always push along the velocity."""
     return lambda x, v: -12.0 * np.sign(v + 1e-12)
 
 
 def each_in_turn(hands, rng):
     """Return a function that gives forces (m, nsim) [N]; each of three controllers acts in every third simulation."""
-    parts = [(slice(k, None, 3), make(hands.x[:, k::3], rng)) for k, make in enumerate((springs, network, thief))]
+    parts = [
+        (slice(k, None, 3), make(hands.x[:, k::3], rng)) for k, make in enumerate((springs, network, along_velocity))
+    ]
 
     def force():
         x, v = hands.x, hands.v
@@ -191,7 +193,7 @@ def test_coarse_encoders_keep_the_guarantee(case):
     for known in (q, 0.0) if case == "constant" else (q,):
         rng = np.random.default_rng(17)
         hands = Hands(rng, 40, True, 0.02)
-        initial, steal = hands.energy(), thief(hands.x, rng)
+        initial, steal = hands.energy(), along_velocity(hands.x, rng)
         lo, hi = ((0, 1), (0, 1)) if case == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, Packets(lo, hi), encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from driven import drive, wander
+from driven import drive, random_walks
 from shared import FIGURE_4, STIFF, T, checkered, loop_of
 
 from haptic_loop.controller.arithmetic import SingularLoop
@@ -126,7 +126,7 @@ WALLED = Network(
 
 @pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
 def test_limits_out_of_reach_change_nothing(network):
-    x = wander(500, 2, 3)
+    x = random_walks(500, 2, 3)
     limiter = loop_of(network, (0, 2), (0, 0)).law(STIFF, (1e6, 1e6), (10.0, 20.0))
     limiting, without = drive(closed(limiter), x), drive(unlimited(network, (0, 2)), x)
     np.testing.assert_allclose(limiting.f[:500], without.f[:500], rtol=0, atol=1e-11)  # forces of up to 31 N
@@ -142,7 +142,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
 
     The linear loop, driven by x - e, sends f_e + rho (e - e_-), where e_- is the slip of the tick before.
     """
-    x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
+    x, limit, rho = random_walks(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
     limiter = loop_of(network, theta, (0, 0)).law(STIFF, limit, rho)
     buffer = drive(closed(limiter), x)
     e = limiter.slips(buffer.z)
@@ -160,7 +160,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
 
 @pytest.mark.slow
 def test_many_simulations_equal_separate_runs():
-    x = wander(300, 2, 5)
+    x = random_walks(300, 2, 5)
     process = closed(loop_of(WALLED, (1, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0)))
     together = drive(process, x).f[:300]
     alone = np.concatenate([drive(process, x[..., i : i + 1]).f[:300] for i in range(5)], axis=2)
@@ -216,7 +216,7 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
 def test_a_slip_makes_its_tick_nonlinear():
     """The state after a tick is nonlinear only if a force slips; the limited force acts theta ticks later."""
     limiter = loop_of(FIGURE_4, (2, 3), (0, 0)).law(STIFF, (3.0, 1.5), (5.0, 2.0))
-    buffer = drive(closed(limiter), wander(60, 2, 11))
+    buffer = drive(closed(limiter), random_walks(60, 2, 11))
     slipped = limiter.limited(buffer.z, buffer.f[:60], LIMITS)
     assert 0 < slipped.any(axis=1).mean() < 1
     seen = np.concatenate([buffer.z[:60], buffer.x[:60]], axis=1)
@@ -264,7 +264,7 @@ def test_the_first_limited_tick_is_found(channel, sign):
 
 def test_limiter_and_environment_are_passive_without_rho():
     """The sum of f_e (x_k - x_{k-1}) is never negative, with walls, limits and V = 0."""
-    x = wander(600, 2, 10)
+    x = random_walks(600, 2, 10)
     f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:600]
     energy = np.cumsum((f * np.diff(x, axis=0, prepend=0.0)).sum(axis=1), axis=0)
     assert energy.min() >= -1e-9

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from driven import drive, wander
+from driven import drive, random_walks
 from evaluate import reported, this_environment
 from messages import says
 from scipy.optimize import brentq
@@ -47,7 +47,7 @@ def walled(network: Network, coupling, theta, psi) -> Process:
 @pytest.mark.parametrize("damping", [0.0, 0.3, 50.0])
 def test_walls_return_at_most_their_stored_energy(damping):
     """f[k] (x[k] - x[k-1]) is at least the rise of the potential energy in every tick, up to rounding."""
-    x = wander(2000, 1, 20)
+    x = random_walks(2000, 1, 20)
     f = drive(walled(one(700.0, damping, 0.004), NoCoupling(), [0], [0]), x).f[:2000]
     depth = np.maximum(x - 0.004, 0)
     potential = 700.0 * depth**2 / 2
@@ -87,7 +87,7 @@ def test_wall_forces_that_are_not_determined_are_refused():
 def test_a_wall_behind_a_coupling_matches_root_finding():
     """Brent's method solves K y + B (y - y-)/T = wall(u) with u = x - y, one equation in each tick."""
     K, B, stiffness, damping, gap = 900.0, 0.4, 3000.0, 2.0, 2e-3
-    x = wander(400, 1, 1)[:, 0, 0]
+    x = random_walks(400, 1, 1)[:, 0, 0]
     expected, y_old, h_old = [0.0], 0.0, 0.0  # theta = 1
 
     def push(u):
@@ -113,7 +113,7 @@ class Weighted(Coupling):
 def test_a_wall_behind_an_own_coupling():
     """A wall between two contacts sends f = max(0, k w) with w = a - b - 2 (0.8 f + 0.2 f-)/900."""
     network = Network(("a", "b"), walls=(Wall(("a", "b"), 3000.0),))
-    x = wander(60, 2, 1)
+    x = random_walks(60, 2, 1)
     f, expected = 0.0, []
     for a, b in x[..., 0]:
         expected.append(f := max(0.0, 3000 * (a - b - 2 * 0.2 / 900 * f) / (1 + 3000 * 2 * 0.8 / 900)))
@@ -142,7 +142,7 @@ def test_a_touching_wall_is_a_spring_damper(coupling, psi):
     """If walls always touch, two runs differ by as much as with spring-dampers in place of the walls."""
     walls = (Wall(("contact 1", GROUND), 5000.0, 3.0, -1.0), Wall(FIGURE_4.contacts, 2000.0, 1.0, -1.0))
     network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
-    x = wander(300, 2, 2)
+    x = random_walks(300, 2, 2)
     f = drive(walled(network, coupling, (1, 2), psi), x).f[:300]
     F = force_map(environment(held(network), T), coupling, (1, 2), psi)
     linear = drive(Process(Law(F), np.full(2, np.inf), np.zeros(2)), x).f[:300]
@@ -168,7 +168,7 @@ def test_walls_between_nodes_keep_the_whole_environment_passive():
         BOXED.contacts, BOXED.springs, BOXED.masses, (*BOXED.walls[:2], Wall(FIGURE_4.contacts, 2e3, 1, 1e-3))
     )
     process = walled(network, NoCoupling(), (0, 0), (0, 0))
-    x = wander(3000, 2, 10)
+    x = random_walks(3000, 2, 10)
     x -= x[0]
     buffer = drive(process, x)
     energy = np.cumsum((buffer.f[1:3000] * np.diff(x, axis=0)).sum(axis=1), axis=0)

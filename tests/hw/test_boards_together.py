@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sessions import in_fork, strike
+from sessions import in_fork, inject_faults
 from shared import checkered
 
 from haptic_loop.cli import bridge, identify, session_cli
@@ -125,7 +125,7 @@ def test_a_fault_of_one_board_stops_both(armed, board, fault):
     """A fault of either board or link ends the session, and both motors are at zero within 50 ms."""
 
     def run():
-        strike(armed, f"{fault}@0.6", board=board)
+        inject_faults(armed, f"{fault}@0.6", board=board)
         armed.run_until_armed(0.7)
         assert armed.session.stage in ENDED - {Stage.FINISHED}
         assert max(armed.zero_after(0.6), 0) < 0.05

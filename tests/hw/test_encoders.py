@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from causes import cause_of, expect_stop
 from msgspec.structs import replace
-from sessions import in_fork, strike
+from sessions import in_fork, inject_faults
 from shared import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
@@ -380,7 +380,7 @@ def ended(rehearsal, *faults, lets_go=9.0):
 
     Return stage, cause and log.
     """
-    strike(rehearsal, *faults)
+    inject_faults(rehearsal, *faults)
     rehearsal.actions.append((lets_go, rehearsal.actions[0][1]))
     session = rehearsal.run_until_armed(8.0)
     return session.stage, session.cause, [event.cause for event in session.log]

@@ -8,7 +8,7 @@ import pytest
 from causes import cause_of
 from rich.console import Console
 from scipy.optimize import brentq
-from sessions import AT_REST, FAST, in_fork, rehearsal_of, session_with, strike
+from sessions import AT_REST, FAST, in_fork, inject_faults, rehearsal_of, session_with
 from shared import FakePort
 
 from haptic_loop.cli import bridge
@@ -116,7 +116,7 @@ def test_duplicated_frames_change_no_force(harmless):
     """A frame that comes twice, on either side, changes no force."""
 
     def run(*faults):
-        strike(harmless, *faults)
+        inject_faults(harmless, *faults)
         duplicates = harmless.run_until_armed(0.8).counters.duplicates
         return duplicates, np.array([moment.applied for moment in harmless.moments])
 
@@ -155,7 +155,7 @@ def test_repeating_devices_count_as_lost(harmless):
 def test_links_failing_in_the_last_test_stop_sessions(harmless, fault, cause):
     def fail():
         session = harmless.session
-        strike(harmless, f"{fault}@0.75")
+        inject_faults(harmless, f"{fault}@0.75")
         session.stop("asked to", session.now)
         harmless.run_until_armed(0.74)
         assert (session.stage, session.gain) == (Stage.DISARMING, 0.0)
@@ -534,7 +534,7 @@ def test_limited_forces_replay_under_their_guarantee(scenario, link_couplings, t
     assert replay(*load(path)).identical
 
 
-class _Thief:
+class _ActiveController:
     """A controller that pushes along the motion, so that it gives energy all the time."""
 
     def __init__(self, T):
@@ -560,7 +560,9 @@ def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, link_coup
 
 def test_sessions_with_forces_cut_by_the_budget_stop(scenario, link_couplings, monkeypatch):
     """The budget limits most forces of an active controller, and the record has every tick in which it does."""
-    monkeypatch.setattr("haptic_loop.hw.control.host_controller", lambda scenario, *given: _Thief(scenario.T))
+    monkeypatch.setattr(
+        "haptic_loop.hw.control.host_controller", lambda scenario, *given: _ActiveController(scenario.T)
+    )
     recorder, stop = Recorder(2), (0.8, lambda session, now: session.stop("asked to", now))
     settings = LinkSettings(measure=100, energy_budget=(0.01, np.inf))
     run = rehearsal_of(scenario, link_couplings, recorder=recorder, settings=settings, actions=[stop])
@@ -575,7 +577,9 @@ def test_sessions_with_forces_cut_by_the_budget_stop(scenario, link_couplings, m
 def test_the_bridges_budget_limits_an_active_controller(scenario, link_couplings, monkeypatch, tmp_path):
     """The budget limits an active controller over a lossy line, and the replay repeats this bit by bit."""
     for module in ("control", "recording"):
-        monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
+        monkeypatch.setattr(
+            f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _ActiveController(scenario.T)
+        )
     taken = {}
     for budget in (0.01, 10.0):
         recorder = Recorder(2)

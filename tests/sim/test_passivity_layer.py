@@ -175,7 +175,7 @@ def test_the_shell_bounds_a_users_environment():
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
     energies = {}
 
-    def thief():
+    def along_velocity():
         before = np.zeros(2)
 
         def force(u):
@@ -187,7 +187,7 @@ def test_the_shell_bounds_a_users_environment():
 
     for start in (0.002, 1e9):
         simulation = assemble(SHORT, coupling)
-        trace = run(netted(simulation, Plugged(thief(), start)), "exact")
+        trace = run(netted(simulation, Plugged(along_velocity(), start)), "exact")
         energies[start] = energy_given(simulation, trace)
         assert trace.net.figures().limited_ticks > 100 or start > 1
     assert energies[0.002] <= 0.002
