@@ -254,7 +254,7 @@ def test_json_on_standard_output_is_only_json(tmp_path):
     assert "growth" in done.stderr
 
 
-def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
+def test_terminals_show_each_stage_of_the_work(tmp_path, monkeypatch, capsys):
     """Standard error names each stage and the error of the last filter; standard output has neither."""
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # without the tests' cache

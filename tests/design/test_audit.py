@@ -127,7 +127,7 @@ def test_impossible_rigid_walls_are_refused():
         msgspec.structs.replace(loop, ranges=Ranges(masses={"tip": (1.0, 2.0)}))
 
 
-def test_a_rigid_wall_needs_what_stiff_springs_need():
+def test_a_rigid_wall_equals_a_very_stiff_spring():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))  # softens K = 2000 N/m by 2e-6 of K
     loop, coupling = wall(2000, 0.4, 1)
     ratio = required_damping(loop.at(ground), coupling, "this-environment").ratio

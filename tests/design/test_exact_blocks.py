@@ -132,7 +132,7 @@ def test_joined_channels_need_the_largest_eigenvalue():
 
 
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 1), (1, 0))])
-def test_figure_4_needs_what_a_sweep_finds(theta, psi):
+def test_figure_4_needs_the_damping_of_a_sweep(theta, psi):
     def needed(w):
         z = np.exp(1j * w)
         F = late(z, theta) @ sent(z, STIFF, psi)
@@ -251,7 +251,7 @@ def test_switching_before_a_spring_needs_the_closed_form(weight, ages):
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
-def test_switching_needs_what_a_dense_sweep_finds(lo, hi):
+def test_switching_needs_the_damping_of_a_sweep(lo, hi):
     alpha = np.array([500.0, 300.0]) * (np.array(lo) < np.array(hi))
     h = (np.array(hi) - np.array(lo)) / 2
 

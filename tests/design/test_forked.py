@@ -44,7 +44,7 @@ def test_without_permission_no_second_process_computes(monkeypatch):
     assert Forked(place).result()[0] == os.getpid()
 
 
-def test_this_process_computes_what_a_killed_one_lost():
+def test_this_process_repeats_the_work_of_killed_ones():
     assert Forked(end_second, os.getpid()).result() == "computed"
 
 

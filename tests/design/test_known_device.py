@@ -976,7 +976,7 @@ def bounded_needs():
     return required(F, loop, this_environment(F, loop.delta).ratio)
 
 
-def test_unequal_bounds_need_what_a_dense_sweep_needs():
+def test_unequal_bounds_need_the_damping_of_a_sweep():
     """The requirement is the least damping at which some beta makes `block_by_hand` positive.
 
     P_t is computed with the least damping of the transmission, c2 with the largest.

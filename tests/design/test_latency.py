@@ -80,7 +80,7 @@ def test_pairs_with_latency_need_the_known_damping(range, needs):
 
 @pytest.mark.parametrize("theta", [0, 1])
 @pytest.mark.parametrize("range", [(0.0, 0.4 * T), (0.1 * T, 0.6 * T)])
-def test_a_wall_needs_what_its_latest_latency_needs(theta, range):
+def test_the_latest_latency_sets_a_walls_requirement(theta, range):
     """The needed delta is the larger root of a quadratic equation for the latest latency t2.
 
     The equation is (delta/t2 - (theta + 3/2) K)(delta/(T - t2) - (theta + 1/2) K) = (theta + 1)^2 K^2.

@@ -173,7 +173,7 @@ def cut(test, most):
 
 
 @pytest.mark.parametrize("closing", [False, True])
-def test_a_force_cut_short_is_no_test(closing):
+def test_a_force_cut_short_tests_no_motor(closing):
     """A test force that an energy budget cuts to 0.1 N does not show that the motor is dead."""
     with expect_stop("little energy: 0.1 (1.3|2.5) 1$"):
         cut(arming_test(closing=closing), 0.1)
@@ -343,7 +343,7 @@ def test_a_moving_hand_hides_no_sign(hand, sign):
 
 
 @pytest.mark.parametrize(("hand", "closing"), checkered([*REACH, *HANDS], [False, True]))
-def test_a_moving_hand_is_no_motor(hand, closing):
+def test_a_moving_hand_hides_no_dead_motor(hand, closing):
     with pytest.raises(SafetyStop, match="axis 1"):
         played(arming_test(closing=closing), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
 
@@ -416,7 +416,7 @@ WRONG = [pytest.param(fault, marks=pytest.mark.slow) for fault in ("motor=0.3", 
 
 
 @pytest.mark.parametrize("fault", ["motor=-1", "scale=0.3", "late=2", "cross=1", *WRONG])
-def test_short_live_sessions_find_what_became_wrong(gripped, fault):
+def test_short_live_sessions_find_new_faults(gripped, fault):
     """A firm hand hides a fault that begins at full gain, until the hand lets go."""
     stage, cause, _ = in_fork(lambda: ended(gripped, f"{fault}@0.8", lets_go=1.3))
     assert stage == Stage.STOPPED, cause

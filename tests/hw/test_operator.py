@@ -29,7 +29,7 @@ def test_a_session_arms_by_itself_once(scenario, link_couplings, start):
     assert stages(session).count(Stage.ARMING) == 1
 
 
-def test_a_key_that_cannot_arm_is_no_arming(scenario, link_couplings, monkeypatch):
+def test_a_key_that_cannot_arm_does_not_count(scenario, link_couplings, monkeypatch):
     """A key that could not arm the session does not count as an arming: the session arms by itself later."""
     held = [False]
     monkeypatch.setattr(Session, "held", property(lambda session: held[0]))
@@ -183,7 +183,7 @@ def test_a_motion_of_another_axis_is_named_twice(x):
     assert check.request is not None
 
 
-def test_the_way_back_is_no_second_motion():
+def test_the_way_back_counts_as_no_motion():
     """A reversed axis moves back in its measured + direction."""
     answers, check = checked([(-8,), (0,)])
     assert not answers

@@ -80,7 +80,7 @@ def test_a_replay_finds_one_changed_bit(trace):
     assert np.flatnonzero(replay(moved, link).asked)[0] == 200
 
 
-def test_the_replay_command_says_identical(trace, capsys):
+def test_the_replay_command_reports_identical_forces(trace, capsys):
     path = trace[0][0]
     assert replay_command.main([str(path), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"] is True

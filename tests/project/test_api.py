@@ -337,7 +337,7 @@ def test_a_trace_converts_to_pandas(monkeypatch):
     assert name == "t [s]"
 
 
-def test_without_pandas_one_line_says_so(monkeypatch):
+def test_a_missing_pandas_gives_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"^Trace.to_frame needs pandas, .*: pip install pandas$"):
         simulate(SHORT).to_frame()

@@ -182,7 +182,7 @@ def test_own_hand_populations_agree_in_both_engines():
 
 
 @pytest.mark.slow
-def test_the_adversary_searches_what_the_population_draws():
+def test_the_adversary_searches_the_populations_hands():
     """The search finds more growth than a quarter as many random draws, and reports the true growth of its hands."""
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
@@ -341,7 +341,7 @@ def test_files_define_measured_hands_and_populations(tmp_path):
         assert message in str(caught.value)
 
 
-def test_a_state_space_is_no_coupling():
+def test_a_state_space_is_refused_as_a_coupling():
     with pytest.raises(TypeError, match=r"wrap it in Compliance\(\.\.\.\)"):
         simulate(SCENARIO, PUBLISHED["I"].compliance(SCENARIO.T))
 

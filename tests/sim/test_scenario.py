@@ -105,7 +105,7 @@ def test_folders_and_missing_files_are_refused(name, message):
         load(name)
 
 
-def test_a_number_is_no_scenario():
+def test_a_number_is_refused_as_a_scenario():
     with pytest.raises(InputError, match=r"scenario is 3 \(int\), expected a TOML file or one of: .*omega-pair"):
         load(3)
 
