@@ -35,24 +35,15 @@ from haptic_loop.sim.scenario import InputError
 
 
 @dataclass(frozen=True)
-class _Proof:
-    """Whether the file's certificate holds."""
-
-    proved: bool
-    reason: str | None
-
-    def __str__(self) -> str:
-        return "[green]proved[/]" if self.proved else f"[red]none[/]: {self.reason}"
-
-
-@dataclass(frozen=True)
 class _Exported:
     what: str
     states: int
     T_s: float
     file: Path = render.figure("file")
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
-    certificate: _Proof = render.figure("certificate")
+    certificate: Verdict = render.figure(
+        "certificate", lambda found: "[green]proved[/]" if found.proved else f"[red]none[/]: {found.reason}"
+    )
     multiplications: int = render.figure("one tick", "{} multiplications, without a limiter")
     force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
@@ -93,7 +84,7 @@ def main(argv: list[str]) -> int:
         block.system.T,
         path,
         block.system.inputs,
-        _Proof(verdict.proved, verdict.reason),
+        verdict,
         block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
         forces if args.process else None,

@@ -12,7 +12,6 @@ input is then closed. If it cannot start, or ends without a picture, the first p
 
 from __future__ import annotations
 
-import atexit
 import os
 import sys
 from contextlib import suppress
@@ -31,18 +30,6 @@ def begin() -> None:
     """Start the second process of the next Painter."""
     global _begun
     _begun = _started()
-    atexit.register(_end_begun)
-
-
-def _end_begun() -> None:
-    """End the second process if the command ended without a Painter."""
-    if _begun:
-        _end(_begun)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.communicate()
 
 
 def _started() -> subprocess.Popen[bytes] | None:
@@ -70,7 +57,8 @@ class Painter:
 
     def __del__(self) -> None:
         if self._process and self._process.returncode is None:
-            _end(self._process)
+            self._process.kill()
+            self._process.communicate()
 
     def ask(self, function: str, *arguments: Any) -> None:
         """Let the second process draw the figure that a function of sim.plots returns for these arguments."""

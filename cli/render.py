@@ -12,14 +12,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, field, fields, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from haptic_loop.cli.painter import skip_docstrings
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.files import InJson, plain, remove, write_json
+from haptic_loop.design.files import InJson, plain, remove, write, write_json
 from haptic_loop.design.result import DesignFailed, Requirement
 
 if TYPE_CHECKING:  # loaded only by commands that need them
@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # loaded only by commands that need them
     from haptic_loop.design.coverage import Robustness
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
+    from haptic_loop.sim.trace import Trace
 
 # ---- the terminal and progress bars; rich is imported in functions, because --help does not need it
 
@@ -149,6 +150,14 @@ def remove_earlier(folder: Path, *files: str) -> None:
     Raises InputError if a file cannot be removed, and keeps all files if the command has read one of them.
     """
     remove(*(folder / file for file in ("report.json", *files)))
+
+
+def save_run(folder: Path, trace: Trace, report: Any, models: Mapping[str, str]) -> list[Path]:
+    """Replace the files of an earlier run by a trace with its report, and by models (file name -> XML)."""
+    labelled = replace(trace, meta=plain(report))
+    remove_earlier(folder, "trace.npz", "trace.csv", *models, "figure.png")
+    files = [labelled.save_npz(folder / "trace.npz"), labelled.save_csv(folder / "trace.csv")]
+    return [*files, *(write(folder / name, xml) for name, xml in models.items())]
 
 
 def pictures(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from haptic_loop.cli import options, render
@@ -15,7 +14,6 @@ from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.certificate import named
-from haptic_loop.design.files import write
 from haptic_loop.design.forked import Forked
 from haptic_loop.design.result import CAVEATS, Chosen, finite
 from haptic_loop.sim import accuracy
@@ -56,6 +54,7 @@ def main(argv: list[str]) -> int:
     render.announce(args, verdicts.verdict(assessment))
     nearby = _nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment)
     from haptic_loop.sim.report import beside_the_paper, run_report
+    from haptic_loop.sim.view.drawn_object import scene_xml
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
@@ -71,7 +70,7 @@ def main(argv: list[str]) -> int:
     tables, left_out = _tables(scenario, report)
     render.show(args, tables, [*report.remarks, *left_out], _details(report))
     with render.progress("storing the trace and drawing the picture"):
-        files = _save(out, run, report)
+        files = render.save_run(out, run.trace, report, {"scene.xml": scene_xml(run.simulation)})
         if drawn:
             files.append(painter.save(out / "figure.png"))
     render.publish(args, report, (), folder=out, files=files)
@@ -161,16 +160,6 @@ def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robust
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
         return None
     return Forked(robustness_nearby, loop, chosen.coupling, named(chosen.required_condition))
-
-
-def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
-    from haptic_loop.sim.view.drawn_object import scene_xml
-
-    result = replace(run.trace, meta=render.plain(report))
-    render.remove_earlier(out, "trace.npz", "trace.csv", "scene.xml", "figure.png")
-    files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
-    files.append(write(out / "scene.xml", scene_xml(run.simulation)))
-    return files
 
 
 def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tuple[Any, ...]:

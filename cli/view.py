@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from haptic_loop.cli import options, render
 from haptic_loop.design.files import check_file, off_table, write_json
@@ -67,12 +67,12 @@ def main(argv: list[str]) -> int:
     finally:
         executor.shutdown(cancel_futures=True)
     events = [_Event.of(*change) for change in session.log]
-    report = _Report(args.case, session.prepared.scenario.name, session.t, session.clipped, events, ended)
+    report = _Report(args.case, session.prepared.scenario.name, session.t, session.clipped, events, **ended)
     for line in report.lines():
         render.console(args).print(line, soft_wrap=True)
     if args.json:
         write_json(args.json, report)
-    return options.exit_code(True, ended.interrupted)
+    return options.exit_code(True, report.interrupted)
 
 
 @dataclass(frozen=True)
@@ -109,47 +109,25 @@ class _Event:
 
 
 @dataclass(frozen=True)
-class _Film:
-    """A film with `fps` pictures per second."""
-
-    file: str
-    pictures: int
-    fps: int
-
-
-@dataclass(frozen=True)
-class _Clock:
-    """How often, and by how much in all, the loop fell behind the window's clock."""
-
-    overruns: int
-    lost_s: float
-
-
-@dataclass(frozen=True)
-class _Ended:
-    interrupted: bool
-    video: _Film | None = off_table("if given", None)
-    clock: _Clock | None = off_table("if given", None)
-
-
-@dataclass(frozen=True)
 class _Report:
     case: str
     scenario: str
     simulated_s: float
     clipped_ticks: int
     events: list[_Event]
-    ended: _Ended = off_table("inlined")
+    interrupted: bool
+    video: dict[str, Any] | None = off_table("if given", None)  # file, number of pictures, pictures per second
+    clock: dict[str, Any] | None = off_table("if given", None)  # how often, and how long, the loop was behind the clock
 
     def lines(self) -> Iterator[str]:
         yield from (event.line() for event in self.events)
         yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
         if torques := self.events[0].assessment.held_torques:
             yield f"Held torques: {torques}."
-        if clock := self.ended.clock:
-            yield f"The loop fell behind the clock {clock.overruns} times: {clock.lost_s:.2f} s lost."
-        if film := self.ended.video:
-            yield f"{film.file}: {film.pictures} pictures"
+        if clock := self.clock:
+            yield f"The loop fell behind the clock {clock['overruns']} times: {clock['lost_s']:.2f} s lost."
+        if film := self.video:
+            yield f"{film['file']}: {film['pictures']} pictures"
 
 
 def _parser() -> options.Parser:
@@ -228,8 +206,8 @@ def _check_film(path: Path, fps: int) -> None:
         raise InputError(f"--fps is {fps}, allowed for a .gif are the numbers that divide 100")
 
 
-def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """Film the session in simulated time, so that the film is reproducible."""
+def _film(args: argparse.Namespace, session: LiveLoop) -> dict[str, Any]:
+    """Film the session in simulated time, so that the film is reproducible. Return fields of the report."""
     from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)
@@ -249,10 +227,11 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
 
     with closing(artist), render.progress("filming") as move:
         pictures_made = save_film(Path(args.video), pictures(move), args.fps)
-    return _Ended(interrupted, _Film(args.video, pictures_made, args.fps))
+    return {"interrupted": interrupted, "video": {"file": args.video, "pictures": pictures_made, "fps": args.fps}}
 
 
-def _window(session: LiveLoop, duration: float | None) -> _Ended:
+def _window(session: LiveLoop, duration: float | None) -> dict[str, Any]:
+    """Show the session in a window. Return fields of the report."""
     from haptic_loop.sim.view.stage import NoWindow, show, stage_for
 
     interrupted = False
@@ -262,4 +241,5 @@ def _window(session: LiveLoop, duration: float | None) -> _Ended:
         raise InputError(f"{error}; --video FILE.gif needs no window") from None
     except KeyboardInterrupt:
         interrupted = True
-    return _Ended(interrupted, clock=_Clock(session.pace.overruns, session.pace.lost))
+    clock = {"overruns": session.pace.overruns, "lost_s": session.pace.lost}
+    return {"interrupted": interrupted, "clock": clock}

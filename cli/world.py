@@ -16,7 +16,7 @@ from haptic_loop.cli.painter import Painter
 from haptic_loop.design.api import store
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.environments import ANY_ENVIRONMENT
-from haptic_loop.design.files import off_table, write
+from haptic_loop.design.files import off_table
 from haptic_loop.design.result import Chosen, Design, listed
 from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose
@@ -178,14 +178,11 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
         interrupted=trace.interrupted,
         wall_s=time.perf_counter() - began,
     )
-    labelled = replace(trace, meta=render.plain(report))
-    render.remove_earlier(out, "trace.npz", "trace.csv", *_WRITTEN, "figure.png")
-    files = [labelled.save_npz(out / "trace.npz"), labelled.save_csv(out / "trace.csv")]
-    written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
-    files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
+    models = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
+    files = render.save_run(out, trace, report, dict(zip(_WRITTEN, models, strict=True)))
     if trace.t.size > 1 and not args.no_plot:
         title, around = f"{scenario.name}: a MuJoCo world", Contacts(scenario.environment.contacts)
-        shown = labelled.signals, title, 1.0, None, None, around
+        shown = trace.signals, title, 1.0, None, None, around
         painter.ask("draw_run", *shown)
         files.append(painter.save(out / "figure.png"))
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."

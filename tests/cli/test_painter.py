@@ -125,9 +125,9 @@ print(painter._begun.pid, flush=True)
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system shows no processes in /proc")
 @pytest.mark.parametrize("end", ["os._exit(1)", "raise SystemExit(2)", "os.kill(os.getpid(), 9)"])
 def test_no_second_process_outlives_the_first(end):
-    program = [sys.executable, "-X", "dev", "-W", "error", "-c", LEFT.format(end=end)]
+    program = [sys.executable, "-c", LEFT.format(end=end)]
     done = subprocess.run(program, capture_output=True, text=True, check=False, env=ENVIRONMENT)
-    assert "Warning" not in done.stderr
+    assert not done.stderr
     patience = time.monotonic() + 60
     while running(int(done.stdout)) and time.monotonic() < patience:
         time.sleep(0.02)
