@@ -296,7 +296,8 @@ def _covered_limits(
     tried for this-environment before others are searched. `known` is a certificate that has been verified.
     """
     covering = [each for each in requirements.values() if each.certified and each.limiter_rho is not None]
-    for each in sorted(covering, key=lambda each: each.proof != "rational"):
+    if covering:
+        each = min(covering, key=lambda requirement: requirement.proof != "rational")
         swept = "" if each.proof == "rational" else "by a refined sweep, without an exact proof: "
         return ForceLimits(each.limiter_rho, f"{swept}{each.condition} covers limited forces", proof=each.proof)
     extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
@@ -326,10 +327,9 @@ def _by_its_own_block(
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
-            rows, bounded = _rows(condition, loop, requirement), isinstance(condition, LimitedKnownDevice)
-            rho = limiter_rho(loop, proof)
-            covered = ForceLimits(rho, _OWN_PROOF, requirement, rows, proof, proof=requirement.proof)
-            return replace(covered, bounded=bounded)
+            rho, rows = limiter_rho(loop, proof), _rows(condition, loop, requirement)
+            bounded = isinstance(condition, LimitedKnownDevice)
+            return ForceLimits(rho, _OWN_PROOF, requirement, rows, proof, bounded=bounded, proof=requirement.proof)
         except NotProved:  # The proof does not hold in this loop, or would take long.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
@@ -342,9 +342,8 @@ def _by_its_own_block(
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, rows)
-    covered = ForceLimits(
-        loop.per_channel(plain.rho(loop)), _OWN_PROOF, requirement, rows, bounded=limiter is not plain
-    )
+    rho = loop.per_channel(plain.rho(loop))
+    covered = ForceLimits(rho, _OWN_PROOF, requirement, rows, bounded=limiter is not plain)
     try:
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
@@ -459,6 +458,7 @@ class Guarantee:
 
     @property
     def any_environment(self) -> bool:
+        """Whether the guarantee holds in any passive environment."""
         return self.environments == ANY
 
     @property
