@@ -66,10 +66,6 @@ class DualMatrix:
         mean = scale / (2 * np.pi) * (width * (heights[1:] + heights[:-1]).real).sum(axis=0)
         return cls(points, np.diff(slope, axis=0), np.abs(slope[1:]) + np.abs(slope[:-1]), mean, sums)
 
-    def at(self, w: Array) -> Complex:
-        """Return D at frequencies [rad/sample] in [0, pi], shape (k, m, m)."""
-        return self._parts(w)[1]
-
     def lower(self, swept: Array, wanted: float) -> tuple[float, Array, Array]:
         """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
