@@ -1,14 +1,14 @@
 """Conditions under which no passive human can make a loop oscillate.
 
 A condition is a block that must be strictly positive real: stable, with the Hermitian part He[block] > 0 on |z| = 1.
-`Demand` (design.facts) holds it as free + s gain, where s multiplies the damping Delta_D that the devices guarantee.
-Poles at z = 1 are split off by `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the
-required damping), over Fractions (an exact proof), over stacks and over sampled responses (maps and designs).
-docs/theory.md derives the conditions; numbers such as (12) are equations of the paper.
+`Demand` (design.facts) holds the block as free + s gain, where s multiplies the damping Delta_D that the devices
+guarantee. Poles at z = 1 are split off by `over_z_minus_one`. The same expression serves sweeps in floating point,
+which give the required damping, and exact proofs over Fractions. Maps and designs evaluate it for many couplings at
+once, or for sampled responses. docs/theory.md derives the conditions. Numbers such as (12) are equations of the paper.
 
-A condition is composed of one **hands' side** and of **facts** of the environment's side. design.facts describes both
-and has the classes to derive new ones from. design.environments and design.known_device search for multipliers.
-design.certificate proves all conditions in the same way, and design.coupling_file stores the proofs.
+design.facts describes the two parts of a condition, the hands' side and the facts of the environment's side, and has
+base classes for new ones. design.environments and design.known_device search for multipliers. design.certificate proves
+all conditions in the same way, and design.coupling_file stores the proofs.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from haptic_loop.design.result import ANY, HERE, RANGES, Environments, Requireme
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
     """Return the block of He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces.
 
-    With F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T_max, in any arithmetic. For forces that latch later
-    than at the tick the block has up to twice the size (design.facts.Latency).
+    With F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T_max. F may be floats, Fractions or responses. If
+    forces latch after the tick, the block has up to twice as many rows (design.facts.Latency).
     """
     return compose(F, loop, late=False)
 
@@ -67,8 +67,9 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
 def _v_hat(H: Block) -> tuple[Array, Block]:
     """Return H(1) and H(1)/2 - (H - H(1))/(z - 1), whose Hermitian part is that of T V-hat/|1 - 1/z|^2.
 
-    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) vanishes at z = 1, so it is divided by |1 - 1/z|^2
-    (docs/theory.md). H(1) must be symmetric. The result is linear in H: V and Theta-hat may be passed separately.
+    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) vanishes at z = 1. Therefore it is divided by |1 - 1/z|^2
+    (docs/theory.md). H(1) must be symmetric. The result is linear in H, so that V and Theta-hat may be passed one by
+    one.
     """
     H1, regular = H.over_z_minus_one()
     return H1, -regular
@@ -77,10 +78,10 @@ def _v_hat(H: Block) -> tuple[Array, Block]:
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
     """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
-    V-hat must be output strictly passive with the level Delta_V, where Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with
-    Delta_V = 0 where phi is 0. With H = V - Theta-hat and the second result R of `_v_hat` a Schur complement gives
-    He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0. Damping enters through
-    Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError unless 0 <= phi < Delta_D T/T_max.
+    V-hat must be output strictly passive with the level Delta_V. Where phi is 0, Delta_V is 0, and elsewhere
+    Delta_V^-1 = Phi^-1 - Delta_D^-1 (14). Let H be V - Theta-hat, and R the second result of `_v_hat`. A Schur
+    complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second row of blocks has rows only for phi > 0.
+    Theta-hat and Delta_D^-1 are proportional to 1/s. Raises ValueError unless 0 <= phi < Delta_D T/T_max.
     """
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None or not len(phi) else phi, T)
@@ -91,7 +92,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     short = np.flatnonzero(shortage)
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
-        """Return H(1) and the block with this lower right corner; both are linear in H and the corner."""
+        """Return H(1), and the block with this lower right corner. Both are linear in H and the corner."""
         H1, regular = _v_hat(H)
         if not short.size:
             return H1, regular
@@ -107,15 +108,15 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
     """Return the block E-hat + Phi without its pole; the block must be positive real. `delayed` is Psi E.
 
-    E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2, so the
-    block is T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
+    E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z). The Hermitian part of z/(z-1) on the circle is 1/2, so the
+    block is T (z R + E(1)/2) + Phi. With a delay the environment is not passive; Phi (14) covers the shortage.
     """
     T, E1 = delayed.T, delayed.dc()
     return Demand(T * _regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
 
 
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
-    """Return the largest shortage of passivity of E-hat + Phi [N s/m] by a sweep, and its frequency w [rad/sample]."""
+    """Return the largest shortage of passivity [N s/m] of E-hat + Phi by a sweep, and its frequency [rad/sample]."""
     demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
     block = demand.free + demand.gain
 
@@ -132,8 +133,8 @@ def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
     return hermitian_floor(demand.free + demand.gain, -slack / 2, -slack)[0] >= -slack
 
 
-#: A 2 x 2 gain counts as singular if its determinant is below _SINGULAR times the product of its diagonal. Diagonal
-#: entries below _NOTHING times the largest one count as rounding errors.
+#: A 2 x 2 gain counts as singular if its determinant is below _SINGULAR times the product of its diagonal entries. A
+#: diagonal entry below _NOTHING times the largest one counts as a rounding error.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are processed together, because they fit into the processor's cache
 
@@ -151,7 +152,7 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 def _least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
-    If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
+    If gain is singular, free must be positive on the null space of gain. A Schur complement covers other directions.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if gain.shape[-1] == 2 and (own > 0).all():
@@ -217,8 +218,8 @@ FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 class Condition(ABC):
     """A block that must be strictly positive real. A user's own condition needs a name and `demand`.
 
-    `design.certificate` proves and verifies the block like that of every condition. The author claims that the
-    block keeps a loop safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
+    `design.certificate` proves and verifies the block of every condition in the same way. That the block keeps a loop
+    safe is the claim of its author. A loop with an item of `BEYOND` is refused unless `covers` names the item.
     """
 
     name: str  # name in requirements, certificates and reports
@@ -234,7 +235,7 @@ class Condition(ABC):
             raise InputError(f"covers of the condition {cls.__name__} is {named!r}, expected a tuple of {allowed}")
 
     def separable(self, loop: Loop) -> bool:
-        """Return whether the condition judges each channel alone for a coupling without cross terms."""
+        """Return whether each channel is judged alone if the coupling does not connect the channels."""
         return False
 
     @property
@@ -250,13 +251,13 @@ class Condition(ABC):
         """
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the damping that the devices need, from a refined sweep. Raises SingularLoop."""
+        """Return the damping that the devices need, by a refined sweep. Raises SingularLoop."""
         demands = [self.is_demand(self.demand(each, coupling)) for each in self._loops(loop)]
         shares = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
         return max(shares, key=lambda requirement: requirement.ratio)
 
     def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with its guarantee; infinite for a loop that is not covered or is singular."""
+        """Return the requirement with its guarantee. It is infinite for a loop that is singular or not covered."""
         reason = self.beyond(loop)
         try:
             requirement = (
@@ -273,7 +274,7 @@ class Condition(ABC):
         return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
-        """Return the function w (k,) [rad/sample] -> required over available damping (k,), or None if it is unknown."""
+        """Return the function w (k,) [rad/sample] -> required over available damping (k,), or None if there is none."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         return partial(least_scale, self.demand(loop, coupling, **more))
 
@@ -288,7 +289,7 @@ class Condition(ABC):
         return {f"P{i or ''}": self.is_demand(self.demand(each, coupling, exact=True, **more)) for i, each in loops}
 
     def is_demand(self, demand: Demand[Block]) -> Demand[Block]:
-        """Return `demand`, the result of a user's own code. Raises InputError unless it is a Demand."""
+        """Return `demand`, which a user's own code made. Raises InputError unless it is a Demand."""
         if not isinstance(demand, Demand):
             raise InputError(f"the demand of condition {self.name} is {shown(demand)}, expected a Demand")
         return demand
@@ -320,19 +321,19 @@ class Condition(ABC):
         return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
-        """Return the numbers that a run must use and that a certificate stores with the multipliers, such as rho."""
+        """Return the numbers, such as rho, that a run must use. A certificate stores them with the multipliers."""
         return {}
 
     def limiter_rho(self, loop: Loop) -> tuple[float, ...] | None:
-        """Return rho (m,) [N/m] of the limiter that this condition covers without further proof, or None."""
+        """Return rho (m,) [N/m] of the limiter that the condition covers without another proof, or None."""
         return None
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
-        """Return the length of every multiplier by its name in files; {} for a condition without multipliers."""
+        """Return {name in files: length} of the multipliers; {} for a condition without multipliers."""
         return {}
 
     def by_name(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, tuple[float, ...]]:
-        """Split the concatenated multipliers into one tuple for each name."""
+        """Return {name: values} of the multipliers, which `multiplier` holds one after the other."""
         named_values, start = dict[str, tuple[float, ...]](), 0
         for name, count in self.multiplier_sizes(loop).items():
             named_values[name] = tuple(float(v) for v in multiplier[start : start + count])
@@ -340,7 +341,7 @@ class Condition(ABC):
         return named_values
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the multiplier for every coupling, None), (None, None) if none is needed, or (None, the reason)."""
+        """Return (the multiplier for all couplings or None, the reason why the loop is not covered or None)."""
         return None, self.beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
@@ -348,7 +349,7 @@ class Condition(ABC):
         return None
 
     def members(self, loop: Loop) -> tuple[Member, ...]:
-        """Return the environments that are proved one by one, with the matrices P, P1, P2, .."""
+        """Return the environments that are proved one by one. Their proofs are the matrices P, P1, P2, .."""
         return loop.members()
 
     def guarantee(self, loop: Loop) -> Environments:
@@ -357,13 +358,13 @@ class Condition(ABC):
         return RANGES if loop.ranges else HERE
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        """Return the beginning of a message on a matrix: the member of the ranges that it belongs to, or ""."""
+        """Return the beginning of a message on a proof matrix: the name of its environment in ranges, or ""."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 
     @property
     def origin(self) -> str:
-        """The name and the file of a user's own condition, in words: "joined-devices of joined.py"."""
+        """The name and the file of a user's own condition, such as "joined-devices of joined.py"."""
         file = getattr(sys.modules.get(type(self).__module__), "__file__", None)
         return f"{self.name} of {Path(file).name}" if file else self.name
 
@@ -389,7 +390,7 @@ def _least_damping(
         return refusal(name, available, reason)
     try:
         needed = demand()
-    except SingularLoop as error:  # The map has a pole at z = 1, which rounding has moved inside the circle.
+    except SingularLoop as error:  # The map has a pole at z = 1 that rounding has moved into the circle.
         return refusal(name, available, f"the force map is singular in floating point: {error}")
     if reason := unsound_static(system, needed, available):
         return refusal(name, available, reason)
@@ -413,7 +414,7 @@ def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> 
     for matrix, value in demand.static.items():
         skew, least = _static_errors(value, system.D, end)
         slack = _STATIC
-        if max(skew, -least) > slack:  # The map may consist of rounding errors only.
+        if max(skew, -least) > slack:  # The static matrix may consist of rounding errors only.
             size = max(float(np.abs(part).max()) for part in (value, system.D, end))
             allowed = min(rounding(system, on_circle(frequencies(system))), _STATIC * min(delta) / system.T)
             slack = max(slack, allowed / max(size, 1e-12))
@@ -425,15 +426,15 @@ def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> 
 
 
 def this_environment(F: Lti, loop: Loop) -> Requirement:
-    """Return the damping that this-environment requires for the force map F; the loop's environment is not used."""
+    """Return the damping that this-environment requires for the force map F. The loop's environment is not used."""
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
 def ratio_in(loop: Loop, coupling: Coupling) -> float:
     """Return required over available damping of this-environment for a stable coupling; inf for a singular loop.
 
-    The responses of a force filter and of the environment are multiplied, because the poles of their series are
-    defective.
+    The responses of a force filter and of the environment are multiplied at each frequency. As a state-space system,
+    their series would have defective poles, which rounding moves far.
     """
     if (chain := coupling.in_series(loop.T)) is None:
         try:
@@ -452,14 +453,15 @@ def ratio_in(loop: Loop, coupling: Coupling) -> float:
 
 
 _LOWEST = 1e-6  # [rad/sample] Responses are constant below this frequency.
-_W_ZERO = 1e-10  # [rad/sample] replaces w = 0 in stacks, where the response of a network may be 0/0
+_W_ZERO = 1e-10  # [rad/sample] replaces w = 0 for stacks, because the response of a network there may be 0/0
 _STATIC = 1e-9  # allowed relative asymmetry and negativity of F(1)
 
 
 def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
-    """Return the asymmetry of F(1) and its least eigenvalue, (...,) each, relative to the largest of all matrices.
+    """Return the asymmetry of F(1) and its least eigenvalue, (...,) each, relative to the largest of all entries.
 
-    The other matrices set the scale because F(1) of a free mass should be 0 but is a difference of large numbers.
+    The matrices `elsewhere` count for the scale, because F(1) of a free mass is 0 only up to the rounding of large
+    terms.
     """
     scale = np.max([np.abs(part).max(axis=(-2, -1)) for part in (F1, *elsewhere)], axis=0, initial=1e-12)
     turned = np.swapaxes(F1, -1, -2)
@@ -495,10 +497,10 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
-_ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; for a lossless E rounding causes 2e-13
+_ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; rounding of a lossless E causes 2e-13
 _VANISHES = 1e-5  # size of V, relative to V(1), up to which V counts as vanishing in a direction
-#: passivity, relative to V(1), that is added where V vanishes; ratio above which V counts as not passive there
-_SOFTENED, _NEVER = 1e-12, 1e6
+_SOFTENED = 1e-12  # passivity, relative to V(1), that is added in directions in which V vanishes
+_NEVER = 1e6  # A larger required over available damping means that V is not passive at its frequency.
 
 
 def asymmetric(V1: Array) -> str | None:
@@ -508,9 +510,10 @@ def asymmetric(V1: Array) -> str | None:
 
 
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
-    """Return the least s (k,) of the demand at w (k,), with _SOFTENED V(1) added to the gain where V vanishes.
+    """Return the least s (k,) of the demand at w (k,) [rad/sample].
 
-    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0.
+    If V and Theta-hat vanish in one direction, so does V-hat, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0.
+    In such directions _SOFTENED V(1) is added to the gain.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -537,8 +540,8 @@ _CHUNK = 256  # ticks summed at once
 def _l1_gain(F: Lti) -> Array:
     """Return an upper bound of the sum over all ticks of |impulse response|, (p, m); inf for an unstable F.
 
-    Ticks are summed until the bound of the remaining sum is small. With A'PA <= r^2 P and r < 1 this bound follows from
-    |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
+    Ticks are summed until a bound of the remaining sum is small. The bound is |c A^k b| <= r^k sqrt(c P^-1 c' b'P b),
+    summed over k, for a P > 0 with A'PA <= r^2 P and r < 1.
     """
     import scipy
 
@@ -571,10 +574,11 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     """Return the Coulomb friction W (p,) [N] that dissipates the work of encoder steps (m,) [m] (docs/theory.md).
 
     Errors of at most q_j/2 change force i by at most W_i = sum_j |F_ij|_1 q_j/2, with the `_l1_gain` |F_ij|_1. The
-    friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind a
+    friction acts at the encoder's own coordinate, in addition to the damping delta. W is not proved to suffice behind a
     limiter or walls, nor for design.known_device, where the error also multiplies beta (v+ - v). `axes` lists the
-    number of axes of each device; () means one each. Friction of a device with several axes opposes its velocity in
-    space and must be at least |W|_2 of these axes. Raises ValueError for a wrong number of steps or a negative step.
+    number of axes of each device; () means one axis each. The friction of a device with several axes opposes its
+    velocity in space and must be at least |W|_2 of these axes. Raises ValueError for a wrong number of steps or a
+    negative step.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
@@ -617,6 +621,6 @@ def _least_scales(demand: Demand[Sampled]) -> Array:
 
 
 def _regular_part(E: Lti) -> Lti:
-    """Return E z/(z-1) without its pole: the Hermitian part on the circle is the same, except at z = 1."""
+    """Return E z/(z-1) without its pole at z = 1. Elsewhere on the circle the Hermitian part is the same."""
     _, regular = E.over_z_minus_one()
     return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

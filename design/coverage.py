@@ -1,4 +1,4 @@
-"""Compute figures of reports: requirements for switching delays, over ranges, and in environments nearby."""
+"""Compute figures of reports: the damping required for switching delays, over ranges, and in similar environments."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NOT_COVERED = (
 
 @dataclass(frozen=True)
 class _Playout:
-    """Requirement of this-environment for the constant delay hi, as behind a playout buffer."""
+    """Requirement of this-environment for the constant delay hi, which a playout buffer would cause."""
 
     theta: tuple[int, ...]
     required_damping: tuple[float, ...]
@@ -36,21 +36,21 @@ class _Playout:
 
 @dataclass(frozen=True)
 class SwitchingFigures:
-    """Requirement for any switching of the delays within a loop's range, lo to hi (m,) [samples].
+    """Requirement for delays that switch at every tick within a loop's range, from lo to hi (m,) [samples].
 
-    If the requirement is infinite, the figures after lo and hi are None.
+    If the requirement is infinite, the fields after `hi` are None.
     """
 
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
     hi: tuple[int, ...] = off_table()
-    alpha: tuple[float, ...] | None = off_table("if given", None)  # all multipliers, alpha [N/m] last (facts.Switching)
+    alpha: tuple[float, ...] | None = off_table("if given", None)  # all multipliers; the last are alpha [N/m]
     playout: _Playout | None = off_table("if given", None)
     not_covered: str | None = off_table("if given", None)
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> SwitchingFigures:
-        """Evaluate a coupling in the nominal environment; `known` is the requirement of SWITCHING there, if known."""
+        """Evaluate a coupling in the nominal environment. `known` is its requirement of SWITCHING, or None."""
         loop = loop.at(loop.environment)
         requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays
         if requirement.reason:
@@ -63,7 +63,7 @@ class SwitchingFigures:
 
 @dataclass(frozen=True)
 class NominalWorst:
-    """A figure in the nominal environment, and its worst value in the members of ranges (Loop.members)."""
+    """A figure in the nominal environment, and its worst value in all environments of `Loop.members`."""
 
     nominal: float
     worst: float
@@ -71,18 +71,21 @@ class NominalWorst:
 
 @dataclass(frozen=True)
 class OverRanges:
-    """Requirement of this-environment and mismatch in the members of ranges; minus infinity dB is null in JSON."""
+    """Requirement of this-environment and mismatch in all environments of `Loop.members`.
+
+    In JSON a mismatch of minus infinity dB is null.
+    """
 
     coupling: str
-    violated: int  # number of members in which this-environment is violated
+    violated: int  # number of environments in which this-environment is violated
     required_over_available: NominalWorst
     rms_mismatch_db: NominalWorst
     relative_mismatch_db: NominalWorst
-    worst: str  # name of the member with the largest rms mismatch
+    worst: str  # name of the environment with the largest rms mismatch
 
     @classmethod
     def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
-        """Evaluate a coupling over the members; members that exert no force have no mismatch."""
+        """Evaluate a coupling in all `members`; a member that exerts no force has no mismatch."""
         ratios, figures = [], {}
         # One set of multipliers for delays that switch serves all members, as in a proof.
         multiplier = THIS_ENVIRONMENT.judge(loop, coupling).multiplier if loop.varying_delay else None
@@ -106,11 +109,14 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures over the ranges of `nominal`'s design without ranges, if it makes one, and of `design`."""
+    """Return the figures of `design` over the ranges, after those of the design that `nominal` makes without ranges.
+
+    The latter are left out if `nominal` is None or its design fails.
+    """
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}
-        with suppress(DesignFailed):  # The design without ranges may fail.
+        with suppress(DesignFailed):
             couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]
@@ -134,9 +140,9 @@ class Robustness:
 
 
 def _nearby(network: Network) -> dict[str, Network]:
-    """Return networks by name, each with one spring, all springs or one mass changed by plus or minus _PERCENT.
+    """Return networks by name. In each, one spring, all springs or one mass is changed by plus or minus _PERCENT.
 
-    Raises ValueError if a changed stiffness or mass would exceed the largest that a network may have.
+    Raises ValueError if a changed stiffness or mass exceeds the largest that a network may have.
     """
     changed = {}
     stiff = [i for i, spring in enumerate(network.springs) if spring.stiffness > 0]
@@ -166,8 +172,8 @@ def _nearby(network: Network) -> dict[str, Network]:
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return the worst requirement of `condition` in the environment and near it, or None if this does not apply.
 
-    It applies to networks without walls and blocks E(z), whose values may be increased by ten percent. The condition
-    must cover the loop, be evaluated for varied loops (`not_varied`), and not hold in any environment.
+    It applies to a network without walls and without a block E(z), whose values may be increased by ten percent. The
+    condition must cover the loop. It must neither hold in every environment nor have a reason `not_varied`.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None

@@ -1,4 +1,8 @@
-"""Conditions with multipliers: this-environment with its facts, and any-environment."""
+"""The conditions this-environment and any-environment, and the search for the multipliers of their facts.
+
+A **fact** is a property of the loop beyond a linear network with constant delays: walls, a limiter of the forces, or
+delays that switch (design.facts). A **multiplier** consists of numbers that a proof may choose freely within bounds.
+"""
 
 from __future__ import annotations
 
@@ -78,22 +82,23 @@ from haptic_loop.design.result import (
 )
 
 # ----------------------------------------------------------------------------------------------------
-# The search for the best multiplier. The block is affine in s, the required over the available damping, and in the
-# multipliers (`Multiplied.scaled`). At finitely many frequencies a semidefinite program (design.cone) gives the least s
-# over the multipliers between their bounds (`Unknowns`), which is a lower bound. Frequencies at which a sweep with this
-# multiplier needs a larger s are added until the sweep attains the bound, or a budget is spent.
+# The search for the best multiplier. Let s be the required over the available damping. `Multiplied.block` is affine in
+# s and in the multipliers. A semidefinite program (design.cone) imposes the block at finitely many frequencies and
+# gives the least s over all multipliers within their bounds (`Unknowns`). This s is a lower bound of the required s. A
+# sweep then finds frequencies at which the program's multiplier needs a larger s. These frequencies are added to the
+# program until the sweep attains the lower bound, or a budget is spent.
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers, which it searches. A subclass adds `map` and `block`."""
+    """A condition whose block is affine in multipliers, and which searches them. A subclass adds `map` and `block`."""
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""
+        """Return the multipliers in the order in which `block` takes their numbers, or () for a block without any."""
         return tuple(each for part in (hands_side(loop), *self.facts(loop)) for each in part.unknowns(loop))
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the map G of `block`. Raises SingularLoop; if `exact`, TooLong for a map too large to be proved."""
+        """Return the map G that `block` takes. Raises SingularLoop, and TooLong if `exact` and G is too large."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None, scaled: bool = False) -> Demand[Block]:
@@ -104,18 +109,18 @@ class Multiplied(Condition):
         """
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """Return the facts of this loop beyond a linear network with constant delays."""
+        """Return the facts that the block of this loop contains."""
         return ()
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
-        """Return the first multiplier of a search; blocks too large for a search use it unchanged."""
+        """Return the first multiplier of a search. A block that is too large for a search uses this multiplier."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
-        """Return the multipliers by name. Raises ValueError for a wrong number of values."""
+        """Return the values of each multiplier by name. Raises ValueError for a wrong number of values."""
         return named_parts(self.unknowns(loop), multiplier)
 
     def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
@@ -127,7 +132,10 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at `multiplier`; for None, at the best multiplier found, with the search's `bound`."""
+        """Return the requirement with this multiplier.
+
+        If `multiplier` is None, the best multiplier is searched, and the result has the search's lower bound `bound`.
+        """
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -141,7 +149,7 @@ class Multiplied(Condition):
             return refusal(self.name, loop.delta, str(error))
 
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
-        """Return the requirement for the map G at `multiplier`; for None, at the best multiplier found."""
+        """Return the requirement for the map G with this multiplier; None means the best one that a search finds."""
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
@@ -185,10 +193,11 @@ def named_parts(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> dict[str
 
 
 _MOST_PEAKS = 3  # largest number of local maxima (`peaks`) whose frequencies are added in a round
-_NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
+_NEAR = 0.1  # A peak that is lower than the highest peak by more than this share is not added.
 # A search ends when a refined sweep exceeds the bound by less than twice _SETTLED, relative to max(bound, 1).
 _SETTLED = 5e-7
-_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; a number below 1e-6 units becomes 0 if `least` is 0
+_DIGITS = 8  # significant digits of a multiplier
+_NOTHING = 1e-6  # A number of a multiplier below this many units becomes 0 if its least allowed value is 0.
 
 
 class _Search:
@@ -205,19 +214,22 @@ class _Search:
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last arguments and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.zeros(system.outputs) if demand.spare is None else demand.spare)
-        self._plain: list[Demand[Lti]] = []  # the block with all unknowns 0, then with one of them at its unit
+        self._plain: list[Demand[Lti]] = []  # the block with all unknowns 0, then with each unknown alone at its unit
         self._root = np.ones(system.outputs)  # scales the rows of an inequality to about one
         self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0  # whether to search at all
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
-        """Return (required over available damping at these values, its frequency [rad/sample]), by a refined sweep."""
+        """Return required over available damping with these values, and the binding frequency [rad/sample]."""
         if self._last is None or self._last[0] != values:
             demand = self._block(values)
             self._last = values, supremum(lambda w: least_scale(demand, w), self._grid)
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`)."""
+        """Return a lower bound of the ratio for all allowed multipliers, and the best multiplier of the search.
+
+        The ratio is required over available damping. The search begins at `values`.
+        """
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._block(tuple(x), scaled=True) for x in (0 * self._units, *units)]
@@ -246,7 +258,7 @@ class _Search:
         return bound, tuple(best)
 
     def _rooms(self, count: int) -> list[Inequality]:
-        """Return the inequalities for the multipliers of the hands' side, in the unknowns of the search and s."""
+        """Return the inequalities that the multipliers of the hands' side must satisfy (`HandsSide.room`)."""
         hands, values = self._hands, np.zeros(self._units.size)
 
         def room(j: int, x: Array) -> Array:
@@ -270,9 +282,10 @@ class _Search:
         return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
-        """Return (largest ratio at these values, frequencies to add); no frequencies if the ratio is at the bound.
+        """Return the largest ratio with these values, and the frequencies [rad/sample] to add to the program.
 
-        The demand's `spare`, a margin that allows rounding the multiplier, is subtracted from the block first.
+        If the ratio is at the bound, no frequencies are returned. The margin `Demand.spare`, which allows the
+        multiplier to be rounded, is subtracted from the block first.
         """
         demand = self._block(values)
         demand = replace(demand, free=demand.free - self._spare) if self._spare.any() else demand
@@ -290,7 +303,7 @@ class _Search:
         return most, np.array([between] if most > bound + 2 * _SETTLED * max(bound, 1.0) else [])
 
     def _parts(self, w: Array) -> tuple[Any, Any]:
-        """Return the Hermitian parts of the constant and of the coefficients of the unknowns and s, at w (k,)."""
+        """Return the constant of the block's Hermitian part at w (k,), and its coefficients of the unknowns and s."""
         z = on_circle(w)
         free = [hermitian(each.free.at(z)) for each in self._plain]
         return free[0] - self._spare, np.array([*(f - free[0] for f in free[1:]), hermitian(self._plain[0].gain.at(z))])
@@ -301,13 +314,13 @@ class _Search:
 
 
 class ThisEnvironment(Multiplied):
-    """Stability for every passive hand in the loop's environment, with walls and delays that switch (design.facts)."""
+    """Stability for every passive hand in the loop's own environment, which may have walls and delays that switch."""
 
     name, covers = "this-environment", BEYOND
 
     @property
     def extensible(self) -> bool:
-        """False for subclasses: the block for limited forces and every shortcut leave out a subclass's facts."""
+        """Whether this is no subclass: `LimitedForces` and fast sweeps would leave out the facts of a subclass."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
@@ -317,8 +330,9 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the first values of each multiplier in a search.
 
-        alpha (`Switching`) is half the width of a device's range of delays times the largest gain of the map G from its
-        displacement to its force. With more than MULTIPLIER_ROWS/2 channels it is the best of _SHARES times this value.
+        For the multiplier alpha of `Switching`, let a be half the width of a device's range of delays times the largest
+        gain of the map G from its displacement to its force. With up to MULTIPLIER_ROWS/2 channels alpha is a. With
+        more channels, alpha is the best of the products of a with each number of _SHARES.
         """
         usual = super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -343,7 +357,7 @@ class ThisEnvironment(Multiplied):
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block; this-environment without a multiplier has touching walls and constant delays."""
+        """Return the block. Without a multiplier all walls of this-environment touch, and its delays are constant."""
         if multiplier is not None or not self.extensible:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
@@ -352,7 +366,7 @@ class ThisEnvironment(Multiplied):
         return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the largest requirement over all members of ranges, with one multiplier for all."""
+        """Return the largest requirement of all environments in ranges, with one multiplier for all of them."""
         if loop.ranges and self.unknowns(loop) and not self.beyond(loop):
             return self._of_members(loop, coupling, multiplier)
         if not self.extensible or self.unknowns(loop) or self.beyond(loop):
@@ -363,9 +377,10 @@ class ThisEnvironment(Multiplied):
         return requirements[worst(requirements)]
 
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """Return the largest requirement of all members with `multiplier`.
+        """Return the largest requirement of all environments in ranges with `multiplier`.
 
-        For None, it is the better result of the usual multiplier and of the best multiplier of the worst member.
+        If `multiplier` is None, two multipliers are tried, and the smaller result is returned. One is `usual`. The
+        other is the best multiplier for the environment that requires the most damping with `usual`.
         """
         loops = [loop.at(member.network) for member in loop.members()]
 
@@ -383,8 +398,9 @@ class ThisEnvironment(Multiplied):
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         """Return the reason why a static map is asymmetric or negative, or None.
 
-        Inputs of channels and of walls have different units. So the asymmetry of an entry is compared with the sizes of
-        its row and its column, and a negative eigenvalue with the largest size of all channels, or of all walls.
+        The inputs of channels and of walls have different units. So the asymmetry of an entry is compared with the
+        sizes of its row and of its column. A negative eigenvalue of a diagonal block is compared with the largest size
+        in this block.
         """
         if not loop.environment.walls:
             return super().unsound_static(G, loop, demand)
@@ -402,7 +418,7 @@ class ThisEnvironment(Multiplied):
         return ratio_in(loop, coupling) if quick else super().ratio(loop, coupling)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the ratios (n,) of `Condition` for constant delays and touching walls; None for a subclass."""
+        """Return required over available damping (n,) for constant delays and touching walls; None for a subclass."""
         if not self.extensible:
             return None
         poles = loop.F(coupling).poles()
@@ -421,7 +437,7 @@ _ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map wi
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """Return the requirement of this-environment, with constant delays and touching walls, for each of the members."""
+    """Return the requirement of this-environment for each member of ranges, for constant delays and touching walls."""
     requirements = []
     for member in members:
         try:
@@ -437,7 +453,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 
 
 class SwitchingDelays(ThisEnvironment):
-    """The condition this-environment for delays that switch, reported as a separate requirement "switching"."""
+    """The condition this-environment for delays that switch. Reports list it as "switching"."""
 
     name, covers = "switching", BEYOND
 
@@ -450,7 +466,7 @@ class SwitchingDelays(ThisEnvironment):
 
 
 SWITCHING = SwitchingDelays()
-_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # factors on alpha that `ThisEnvironment.usual` tries
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # factors of alpha that `ThisEnvironment.usual` tries
 
 
 def _half_widths(loop: Loop) -> Array:
@@ -459,19 +475,23 @@ def _half_widths(loop: Loop) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The condition "limiter": forces pass through the limiter of controller.law. any-environment with psi = 0 covers
-# limited forces without this condition, with rho = 0 (docs/theory.md).
+# The condition "limiter": forces pass through the limiter of controller.law. If psi = 0, any-environment covers limited
+# forces without this condition. The limiter then has rho = 0 (docs/theory.md).
 
-BETA = 0.01  # default rho of a limiter under this-environment, relative to the device's least damping over T
+BETA = 0.01  # default of beta: rho of a limiter, relative to the least eigenvalue of the device's damping over T
 
 
 @dataclass(frozen=True)
 class LimitedForces(ThisEnvironment):
-    """The condition this-environment for forces behind a limiter with rho_i = beta lambda_min(Delta_i)/T [N/m]."""
+    """The condition this-environment for forces that a limiter limits.
+
+    The limiter of device i has the stiffness rho_i = beta lambda_min(Delta_i)/T [N/m], with the least eigenvalue
+    lambda_min of the device's damping Delta_i.
+    """
 
     beta: float = BETA
     lags: int = 1  # number of weights c_ij per device
-    held: tuple[float, ...] | None = None  # rho [N/m] per device of a certificate; None: computed from beta
+    held: tuple[float, ...] | None = None  # rho [N/m] per device that a certificate states; None computes it from beta
     name, covers = "limiter", BEYOND
 
     def __post_init__(self) -> None:
@@ -481,7 +501,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device: `held`, or the rho that follows from beta, rounded to six digits."""
+        """Return rho [N/m] per device: `held`, or the rho of beta, rounded to six digits."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -498,7 +518,7 @@ class LimitedForces(ThisEnvironment):
         return (*super().facts(loop), Limited(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """Return c (devices, lags), which is at the end of the multipliers."""
+        """Return the limiter's weights c (devices, lags), the last numbers of `multiplier`."""
         devices = len(loop.devices)
         c = tuple(multiplier)[len(multiplier) - devices * self.lags :] if multiplier else ()
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
@@ -522,14 +542,15 @@ LIMITER = LimitedForces()
 
 
 def beta_of(loop: Loop, certificate: Certificate) -> float:
-    """Return beta of the limiter that a certificate covers; BETA if it covers none or beta is above 1."""
+    """Return beta of the limiter that a certificate covers; BETA if it covers no limiter or if beta is above 1."""
     rho, share = certificate.multipliers.get("rho", ()), loop.least_damping[0] / loop.delta[0]
     beta = float(f"{rho[0] * loop.T / (certificate.available[0] * share):.6g}") if rho else BETA
     return beta if 0 < beta <= 1 else BETA
 
 
 # ----------------------------------------------------------------------------------------------------
-# The condition any-environment (Theorem 4), and its least multiplier Phi (17) for an environment with delay (psi >= 1).
+# The condition any-environment (Theorem 4). An environment with a delay psi >= 1 is not passive. The diagonal
+# multiplier Phi [N s/m] is the damping that makes it passive: E-hat + Phi is passive (17).
 
 
 _ROOM = 1e-6  # increase of Phi, relative to the damping, that covers the solver's tolerance
@@ -538,7 +559,8 @@ _ROOM = 1e-6  # increase of Phi, relative to the damping, that covers the solver
 def least_phi(loop: Loop) -> Array | None:
     """Return a small Phi (m,) [N s/m] that is verified, or None for psi = 0, which needs no Phi.
 
-    Phi covers every frequency and is below Delta_D. Raises Infeasible or DesignFailed if no such Phi is found.
+    E-hat + Phi is passive at all frequencies, and Phi is below Delta_D. Raises Infeasible or DesignFailed if no such
+    Phi is found.
     """
     if not any(loop.psi):
         return None
@@ -554,9 +576,12 @@ def least_phi(loop: Loop) -> Array | None:
 def least_multiplier(loop: Loop) -> Array:
     """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling, and its
-    sum of Phi_i/delta_i is the least below this level. Raises Infeasible, with the damping that would be needed, if no
-    such Phi exists, diagonal or not, and DesignFailed if no diagonal Phi is found.
+    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Below
+    this level, its sum of Phi_i/delta_i is the least.
+
+    Raises:
+        Infeasible: No such Phi exists, diagonal or not; the message states the damping that would be needed.
+        DesignFailed: No diagonal Phi was found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
@@ -566,8 +591,8 @@ def least_multiplier(loop: Loop) -> Array:
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
-    # The Phi of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
-    # halfway between its least possible value and Delta_D.
+    # Without an upper limit, the Phi of least trace may reach Delta_D and leave no damping for the coupling. So Phi
+    # stays below a level halfway between the least multiple of Delta_D that suffices and Delta_D.
     return _of_least_trace(regular, (1 + least) / 2 * level) * delta
 
 
@@ -575,9 +600,10 @@ _PROBLEM = "the multiplier Phi of the environment"
 
 
 def _of_least_trace(regular: Lti, most: Array) -> Array:
-    """Return the entries, >= 0, of a diagonal Phi <= most (m, m) with small trace, by cutting planes over frequency.
+    """Return the entries (m,) >= 0 of a diagonal Phi <= most (m, m) with small trace, by cutting planes over frequency.
 
-    `regular` + Phi is passive by a sweep, and Phi exceeds `most` by at most _ROOM. Raises Infeasible or DesignFailed.
+    A sweep shows that `regular` + Phi is passive. Phi exceeds `most` by at most _ROOM. Raises Infeasible or
+    DesignFailed.
     """
     m, grid = regular.inputs, np.concatenate([[0.0], frequencies(regular)])
     blocks = [Inequality.least(range(m), 0.0), Inequality.of(lambda x: most - np.diag(x), range(m))]
@@ -607,9 +633,10 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
 
 
 class _AnyEnvironment(Multiplied):
-    """Theorem 4 of the paper: stability in every passive environment, or for psi >= 1 in the loop's environment only.
+    """The condition of the paper's Theorem 4 for stability with every passive hand.
 
-    For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only.
+    For psi = 0 it holds in every passive environment, and it covers walls, a latency and switching delays. For psi >= 1
+    it holds in the loop's environment only and has the multiplier Phi (m,) [N s/m].
     """
 
     name, source = "any-environment", "the paper's Theorem 4"
@@ -617,11 +644,11 @@ class _AnyEnvironment(Multiplied):
 
     @property
     def _extended(self) -> bool:
-        """Whether this is a user's subclass, whose facts only the composed block contains."""
+        """Whether this is a user's subclass. Only the block of `compose_any` contains its facts."""
         return type(self) is not _AnyEnvironment
 
     def _in_frame(self, loop: Loop) -> bool:
-        """Return whether `compose_any` composes the block: for a latency, switching delays, or a user's facts."""
+        """Return whether `compose_any` builds the block. It does so for a latency, switching delays and own facts."""
         return bool(self._extended or loop.latency or loop.varying_delay)
 
     def separable(self, loop: Loop) -> bool:
@@ -672,7 +699,7 @@ class _AnyEnvironment(Multiplied):
         return partial(least_scale, self.block(V, loop, self.usual(None, loop) if multiplier is None else multiplier))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the ratios (n,) of `Condition`; for None with the first multiplier of a search."""
+        """Return required over available damping (n,); None as the multiplier means the first one of a search."""
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
         values = self.usual(None, loop) if multiplier is None else multiplier
         return any_environment_ratios(
@@ -685,7 +712,11 @@ class _AnyEnvironment(Multiplied):
         return "Theorem 4 needs a coupling with a compliance V(z), and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with `multiplier`; for None, with `least_phi` if psi >= 1, else the best found."""
+        """Return the requirement with this multiplier.
+
+        If `multiplier` is None, it is `least_phi` for psi >= 1, and the best multiplier that a search finds for psi =
+        0.
+        """
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)
@@ -748,10 +779,11 @@ ANY_ENVIRONMENT = _AnyEnvironment()
 
 
 def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
-    """Return the alpha [N/m] that admits the stiffest coupling for any environment; `damping` is delta/T [N/m].
+    """Return the multiplier alpha [N/m] of `Switching` that admits the stiffest coupling for any environment.
 
-    This alpha minimises the mean over frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), where vt is the mean
-    of the windows of the delays lo and hi, and h = (hi - lo)/2 (docs/theory.md, "Facts that hold together").
+    The delay switches between lo and hi [samples], and `damping` is delta/T [N/m]. This alpha minimises the mean over
+    frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha) with h = (hi - lo)/2. Here vt is the mean of the windows
+    1 + 1/z + .. + z^-n for n = lo and n = hi (docs/theory.md, "Facts that hold together").
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)

@@ -2,9 +2,9 @@
 
 The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
 stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or a
-face, which uniformly drawn points never hit. For every combination of present and absent springs, the search therefore
-tries vertices, points on edges, on faces (only for up to _MANY parameters) and inside. A compass search then continues
-from the worst points.
+face, which uniformly drawn points never hit. Therefore the search tries vertices, points on edges, points on faces
+(only for up to _MANY parameters) and points inside. It does so for every combination of present and absent springs. A
+compass search then continues from the worst points.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
 
 _SEED = 0xFACE
-_MANY = 7  # With more parameters, vertices, points on edges and points inside are drawn at random, and none on faces.
+_MANY = 7  # For more parameters the vertices, points on edges and points inside are random, and no face has a point.
 _APART, _SAME = 0.2, 0.05  # least distances of two starts of the compass search and of two maxima, in range widths
-_FIRST, _LAST = 1 / 16, 1 / 128  # first step for up to _MANY parameters, and last step, in range widths
+_FIRST, _LAST = 1 / 16, 1 / 128  # first step (for up to _MANY parameters) and last step, in range widths
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def _member(region: Region, point: Array) -> Member:
 
 
 def _points(region: Region) -> Iterator[Array]:
-    """Yield points of the unit cube: at vertices, on edges, on faces and inside (see _MANY for many dimensions)."""
+    """Yield points of the unit cube: at vertices, on edges, on faces and inside; _MANY says which are random."""
     n = region.low.size
     rng = np.random.default_rng(_SEED)
     if n > _MANY:
@@ -148,7 +148,7 @@ def _points(region: Region) -> Iterator[Array]:
 
 
 def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
-    """Return points with their values, largest value first, without points close to a point of larger value."""
+    """Return points with their values, the largest value first. Points near a point of larger value are left out."""
     chosen: list[tuple[Array, float]] = []
     for i in np.argsort(-np.array(values), kind="stable"):
         if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
@@ -157,9 +157,11 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
-    """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
-    # With many parameters only some vertices were tried, so the first steps move one parameter to an end of its range
-    # (from a vertex: to a neighbouring vertex).
+    """Return a local maximum and its value, by compass search from `point`.
+
+    Each step moves along the best axis. If no move gives a larger value, the step is halved.
+    """
+    # With many parameters only some vertices were tried. So the first steps move one parameter to an end of its range.
     step = 1.0 if point.size > _MANY else _FIRST
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
@@ -179,7 +181,7 @@ def search_ranges(
     over: Callable[[], bool] = lambda: False,
     ratio: Callable[[Loop], float] | None = None,
 ) -> Searched:
-    """Find the members of the ranges that need the most damping under this-environment, or have the largest `ratio`."""
+    """Return the members of the ranges with the largest `ratio`; None stands for `ratio_in` of the coupling."""
     assert loop.ranges
     parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
     return search(parts, lambda member: ratio(loop.at(member.network)), progress, over=over)
