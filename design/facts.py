@@ -2,14 +2,14 @@
 
 Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
 them. The **hands' side** is a lower bound of the energy that every passive hand and the devices dissipate, whatever
-forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. For a known
-motor (Theorem B) the motor's speed v is an input, too. A **fact** of the environment's side describes the forces; it
-adds inputs, a row of the block for each, and multipliers. The quadratic form is
+forces act. Its inputs are the displacements of a period: dx, or xa before and xb after a force latches. For a known
+motor (Theorem B) the motor's speed v is an input, too. A **fact** of the environment's side describes the forces. It
+adds inputs with one row of the block each, and multipliers. The quadratic form is
 
     sum over ticks of f'(displacement that f multiplies) + energy of the damping + terms of the multipliers,
 
 and its block must be strictly positive real, with its pole at z = 1 split off. `Collected` collects the entries of both
-sides and builds the block in any arithmetic.
+sides and builds the block for floats, Fractions or responses.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _product(p: _Weights, q: _Weights) -> list[Any]:
 def _less_advance(p: _Weights, follows: Any) -> list[Any]:
     """Return the weights of (p(1/z) - follows z)/(z - 1), which has no pole at z = 1 because p(1) = follows.
 
-    For p = z^-theta this is -(1 + 1/z + .. + z^-theta), the negative window of a delay.
+    For p = z^-theta and follows = 1 the result is -(1 + 1/z + .. + z^-theta).
     """
     out, left = [], follows
     for weight in p:
@@ -95,7 +95,7 @@ def _less_advance(p: _Weights, follows: Any) -> list[Any]:
 
 @dataclass(frozen=True)
 class Input:
-    """One scalar input of the hands' side: a displacement or a speed of a device at every tick."""
+    """One scalar input of the hands' side: a displacement or a speed of one axis of a device at every tick."""
 
     name: str
     channel: int
@@ -112,17 +112,17 @@ class Collected(Generic[Block]):
     ) -> None:
         """Add the hands' inputs and their rows; `path` has the weights of each channel's nominal delay.
 
-        With `any_object` the energy that a passive object receives is subtracted, so that f_e[k] multiplies the
-        displacement minus (x[k] - x[k-1]) (docs/theory.md, "Facts that hold together").
+        With `any_object` the energy that a passive object receives is subtracted. Then f_e[k] multiplies the
+        displacement minus x[k] - x[k-1] (docs/theory.md, "Facts that hold together").
         """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
-        self._into: list[tuple[int, int, _Weights]] = []  # (output of the inputs' filter, input, weights)
+        self._into: list[tuple[int, int, _Weights]] = []  # (output of `_filter`, input, weights)
         self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of f_e)
         self._steps: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of the steps of f_e)
-        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, whether y, not its steps)
+        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, True for y and False for its steps)
         self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
         self._gain: list[tuple[int, int, Any]] = []  # (row, input, weight) of terms that scale with the damping
@@ -136,13 +136,13 @@ class Collected(Generic[Block]):
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:
-        """Add the limiter's slip as one more input per channel; inputs with `slips` become displacements less slip."""
+        """Add the limiter's slip as an input of each channel. It is subtracted from the inputs with `slips`."""
         for i in self.hands:
             if i.slips:
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Add the quadratic form of the hands' side, in the displacements before the slip is subtracted."""
+        """Add the quadratic form of the hands' side. Its displacements still contain the slip."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -151,7 +151,7 @@ class Collected(Generic[Block]):
                         enter(row, column, form[g, h])
 
     def _with_slip(self, i: Input) -> list[int]:
-        """Return the numbers of the inputs that add up to a hands' input."""
+        """Return the numbers of the inputs whose sum is this input of the hands' side."""
         slip = self.places.get(("de", i.channel)) if i.slips else None
         return [self.places[i.name, i.channel], *([] if slip is None else [slip])]
 
@@ -169,14 +169,14 @@ class Collected(Generic[Block]):
         return self.places["de", channel]
 
     def moving(self, channel: int) -> list[tuple[int, _Weights]]:
-        """Return the inputs that add up to the displacement that a channel's force multiplies, with weights in z."""
+        """Return (input, weights w_0 + w_1 z + ..) of the displacement that a channel's force multiplies."""
         parts: list[tuple[int, _Weights]] = [
             (self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel
         ]
         return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
 
     def slipping(self, channel: int) -> tuple[int, int]:
-        """Return the numbers of the displacement from which the limiter's slip is subtracted, and of the slip."""
+        """Return the number of the displacement from which a channel's slip is subtracted, and that of the slip."""
         (own,) = (self.places[i.name, channel] for i in self.hands if i.channel == channel and i.slips)
         return own, self.slip(channel)
 
@@ -185,15 +185,15 @@ class Collected(Generic[Block]):
         return len(self.places)
 
     def press(self, i: int, wall: int, weights: _Weights) -> None:
-        """Let input i add to the steps of a wall's force."""
+        """Add the weighted input i to the steps of a wall's force."""
         self._into.append((self.channels + wall, i, weights))
 
     def force(self, i: int, channel: int, weights: _Weights) -> None:
-        """Let input i add to the steps of a channel's sent force f_e, besides the environment's response."""
+        """Add the weighted input i to the steps of a channel's sent force f_e."""
         self._force.append((channel, i, weights))
 
     def sums(self, row: int, channel: int, weights: _Weights) -> None:
-        """Add the weighted sent force to a row. The force sums up its steps, so the row has a pole at z = 1."""
+        """Add the weighted sent force to a row. The force is the sum of its steps, so the row has a pole at z = 1."""
         self._sums.append((row, channel, weights))
 
     def steps(self, row: int, channel: int, weights: _Weights) -> None:
@@ -217,7 +217,7 @@ class Collected(Generic[Block]):
         self._gain.append((row, column, weight))
 
     def keep(self, row: int, amount: float) -> None:
-        """Subtract a margin from the row's diagonal entry in a search, so that multipliers may be rounded."""
+        """Reserve a margin on the row's diagonal entry. A search subtracts it, so that multipliers may be rounded."""
         self._keep.append((row, amount))
 
     @property
@@ -248,7 +248,10 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order))
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return (block from inputs to [dx; steps of walls' forces; steps added to f_e; late inputs], late inputs)."""
+        """Return the block from inputs to [dx; steps of walls' forces; steps added to f_e; late inputs].
+
+        The second result lists the late inputs, which rows read one tick later (`before`).
+        """
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -258,9 +261,9 @@ class Collected(Generic[Block]):
     def build(self, G: Block | None) -> tuple[Array, Block, Any]:
         """Return (residue at z = 1 (n, n), block without this pole and without the damping, damping matrix).
 
-        For a Sampled G the residue is 0 and the block keeps its pole; its Hermitian part on the circle is the same. G
-        maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. If G is
-        None, the steps of the forces are inputs instead (`force`).
+        G maps displacements x and wall forces p to sent forces f_e and displacements y across walls. If G is None, the
+        steps of the forces are inputs (`force`). For a Sampled G the residue is 0, and the block keeps its pole, which
+        does not change its Hermitian part on the circle.
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
@@ -326,13 +329,14 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 class Unknowns:
     """The numbers of one multiplier.
 
-    A search keeps each number (for the hands' side: s times the number) between `least` and `most` times its unit.
+    A search keeps each number between `least` and `most` times its unit. For the hands' side, s times the number is
+    kept there.
     """
 
     name: str  # name of the multiplier in files
     units: tuple[float, ...]  # (n,); 0 for a number that is always 0
     expected: str  # the allowed values in words, for messages
-    least: float  # in units; numbers are positive if it is positive, >= 0 if it is 0, of any sign if it is negative
+    least: float  # in units; if it is positive, 0 or negative, the numbers must be positive, >= 0, or of any sign
     most: float
     start: tuple[float, ...] | None = None  # (n,) first values of a search; the units if None
 
@@ -359,7 +363,7 @@ class HandsSide(ABC):
 
     @abstractmethod
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
-        """Return the inputs, each with its weights in the displacement that a force multiplies (`Input.moved`)."""
+        """Return the inputs of this side, in the order of the rows of `damping` and `rest`."""
 
     @abstractmethod
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
@@ -370,11 +374,11 @@ class HandsSide(ABC):
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Return the multipliers. A search's unknowns are s, the factor of the damping, and s times each multiplier."""
+        """Return the multipliers. A search solves for the factor s of the damping and for s times each multiplier."""
         return ()
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return matrices (k, n, n) that must be positive semidefinite; `values` are s times the multipliers."""
+        """Return matrices (k, n, n) that must be positive semidefinite; `values` holds s times the multipliers."""
         return []
 
     def allowed(self, loop: Loop, values: Values) -> Values:
@@ -400,8 +404,8 @@ class Latency(HandsSide):
     """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every device.
 
     The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest period
-    must be longer than t2. If t1 < t2, the multiplier Q weighs both parts together; it may be any symmetric
-    Q <= diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
+    must be longer than t2. If t1 < t2, the multiplier Q (2, 2) [1/s] is the weight of (xa, xb) in the energy of the
+    damping. It may be any symmetric Q that is at most diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
     """
 
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
@@ -434,7 +438,7 @@ class Latency(HandsSide):
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return s I - D Q D, D = diag(tau, T_max - tau)^(1/2), for the Q in `values` and _LATENCIES tau per range."""
+        """Return s I - D Q D, D = diag(tau, T_max - tau)^(1/2), for _LATENCIES values of tau in each range."""
         bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
@@ -448,7 +452,7 @@ class Latency(HandsSide):
             tau = np.linspace(*_ranges(loop)[d], _CLOSER)
             D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
             most = np.linalg.eigvalsh(D[:, :, None] * Q * D[:, None, :]).max()
-            for less in _LESS:  # The reduction covers rounding of the entries, and latencies between the samples.
+            for less in _LESS:  # The reduction covers rounded entries, and latencies between the samples.
                 entries = [float(f"{(1 - less) / most * Q[a, b]:.{_DIGITS}g}") for a, b in ((0, 0), (0, 1), (1, 1))]
                 if _admits(loop, d, entries):
                     break
@@ -484,7 +488,7 @@ def _ranges(loop: Loop) -> list[tuple[float, float]]:
 
 
 def _separate(loop: Loop, d: int) -> tuple[float, float]:
-    """Return q11 = 1/t2 and q22 = 1/(T_max - t1) [1/s] of a diagonal Q, rounded down; 0 for a constant latency."""
+    """Return q11 = 1/t2 and q22 = 1/(T_max - t1) [1/s] of a diagonal Q, rounded down; 0, 0 for a constant latency."""
     if d not in _varies(loop):
         return 0.0, 0.0
     (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
@@ -502,9 +506,10 @@ def _entries(values: Values, d: int) -> Array:
 
 
 def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
-    """Return whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of device d, over the rationals.
+    """Return whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of device d, in exact arithmetic.
 
-    This means q11 tau <= 1, q22 (T_max - tau) <= 1, and a determinant, quadratic in tau, that is nowhere negative.
+    This means q11 tau <= 1, q22 (T_max - tau) <= 1, and (1 - q11 tau)(1 - q22 (T_max - tau)) >= q12^2 tau (T_max -
+    tau). The last difference is quadratic in tau.
     """
     (t1, t2), T = map(rational, _ranges(loop)[d]), rational(loop.T_max or loop.T)
     q11, q12, q22 = map(rational, entries)
@@ -522,8 +527,8 @@ class PeriodCost(NamedTuple):
     """The coefficients of the lower bound L of Theorem B for a period, (m,) each, for known devices.
 
     L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the two ends of the
-    period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m. The formulas
-    beside them hold for a constant period T, with c0, c2 and q of design.known_device.
+    period and vb = (v + v+)/2. The fields are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m. The formulas
+    beside the fields hold for a constant period T, with c0, c2 and q of design.known_device.
     """
 
     move: Any  # c0/(T - q)
@@ -564,9 +569,9 @@ def hands_side(loop: Loop) -> HandsSide:
 
 
 class Fact(ABC):
-    """A property of the environment's side beyond one linear network with constant delays.
+    """A property of the environment's side that a linear network with constant delays does not have.
 
-    A fact that a user adds must define only `enter`; docs/extending.md shows an example.
+    A user's own fact must define only `enter`; docs/extending.md shows an example.
     """
 
     @abstractmethod
@@ -579,11 +584,11 @@ class Fact(ABC):
 
 
 class Walls(Fact):
-    """Walls that make and break contact, with the multipliers a, a + c, d, m of each wall's law.
+    """Walls that make and break contact, with the multipliers a, a + c, d and m of each wall.
 
-    Every wall has the input u, the step of the depth h. A wall with a damper has one more input s >= 0, which is
-    positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z)
-    for the k and b of `laws`.
+    Every wall has the input u, the step of its depth h. A wall with a damper has one more input s >= 0, which is
+    positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
+    `laws` returns k and b.
     """
 
     def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:
@@ -626,10 +631,11 @@ class Walls(Fact):
 class Switching(Fact):
     """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
-    With h = (hi - lo)/2 the work of the force's errors on the displacement dq that the force multiplies is at least the
-    sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha), with the steps df_e of the sent force (docs/theory.md). The last term
-    is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes of a
-    device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
+    A force with the delay of its tick differs from the force with the mean delay. Let h be (hi - lo)/2, dq the
+    displacement that the force multiplies, and df_e the steps of the sent force. The work of the difference is at least
+    the sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha) (docs/theory.md). The last term is the least value of
+    2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes of a device share its delay, so
+    the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
@@ -664,14 +670,14 @@ def _correlation(p: _Weights, q: _Weights) -> list[tuple[int, Any]]:
     return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
 
 
-_SPARE = 0.02  # margin, relative to rho, that a search subtracts from the block's diagonal, so that c may be rounded
+_SPARE = 0.02  # margin of the block's diagonal, relative to rho; a search subtracts it, so that c may be rounded
 
 
 class Limited(Fact):
-    """Forces that are sent through the limiter of controller.law, with the stiffness rho > 0 [N/m] on each device.
+    """Forces that are sent through the limiter of controller.law, with the stiffness rho > 0 [N/m] of each device.
 
-    The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights, so
-    that the force of a device may be limited to a ball or to a box.
+    The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights. So the
+    force of a device may be limited to a ball or to a box.
     """
 
     def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
@@ -694,9 +700,10 @@ class Limited(Fact):
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
-    """Extend the damping's form to matrices Delta.
+    """Return the quadratic form of the damping, extended to matrices Delta.
 
-    If the entry for the inputs a and b of axis i is q delta_i, that for a of axis i and b of axis j is q Delta_ij.
+    If the entry of `form` for the inputs a and b of axis i is q delta_i, then the entry for the input a of axis i and
+    the input b of axis j is q Delta_ij.
     """
     if loop.levels is None:
         return form
@@ -722,11 +729,10 @@ def compose(
     """Return the block of a hands' side with these facts at these multipliers, which are not checked.
 
     Args:
-        G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and displacements across
-            the walls.
+        G: The map from displacements x (m,) and wall forces p to sent forces f_e (m,) and displacements y across walls.
         values: The multipliers by name.
         late: Whether the delays Theta have to be added; False if G contains them.
-        scaled: Whether `values` holds the multipliers of the hands' side times s, so that the block is affine in s and
+        scaled: Whether `values` holds s times the multipliers of the hands' side, so that the block is affine in s and
             all values.
         hands: The hands' side; None for `hands_side(loop)`.
     """
@@ -754,7 +760,7 @@ def compose(
 
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
-    """Add the hands' side's form. If `scaled`, `values` holds s times its multipliers, so their terms are constant."""
+    """Add the form of the hands' side. If `scaled`, its terms with multipliers already contain the factor s."""
 
     def form(values: Values) -> Any:
         return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)
@@ -768,7 +774,7 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
 
 
 def _paths(loop: Loop, switch: bool) -> list[_Weights]:
-    """Return the weights of Theta for each channel; for switching delays the mean of z^-lo and z^-hi."""
+    """Return the weights of Theta for each channel. For switching delays Theta is the mean of z^-lo and z^-hi."""
     spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
     return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
 
@@ -783,7 +789,7 @@ def compose_any(
 ) -> Demand[Block]:
     """Return the block of a hands' side for any passive object behind the coupling V, without delay psi.
 
-    The inputs are those of the hands' side and the facts, followed by df_e, the steps of the sent forces. The block of
+    The inputs are those of the hands' side and of the facts, and then df_e, the steps of the sent forces. The block of
     df_e is V(1)/2 - (V - V(1))/(z-1). The multipliers `values` are not checked.
     """
     values, hands, T = values or {}, hands or hands_side(loop), V.T

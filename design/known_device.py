@@ -1,16 +1,17 @@
 """Conditions for devices with a known motor mass and a known lossy transmission (Theorem B).
 
-this-environment assumes a hand of any stiffness at the motor's shaft. The devices here have a transmission between
-motor and hand: a spring k and a damper b in parallel. The motor feels no hand as stiffer than the transmission, and
-its mass keeps its speed continuous. The known bounds are the motor's least mass m and least damping delta,
-P = k_max^2/b_min, and b_max. Let beta > 0 [s] be any number, and let the force f be held in each period. Then the
-motor, its transmission and every passive hand behind the transmission satisfy
+this-environment assumes that a hand of any stiffness holds the motor's shaft. The devices here have a transmission
+between motor and hand: a spring k and a damper b in parallel. So no hand feels stiffer to the motor than the
+transmission does, and the motor's mass keeps its speed continuous. The known bounds are the motor's least mass m and
+least damping delta, P = k_max^2/b_min, and b_max. Let beta > 0 [s] be any number, and let the force f be held in each
+period. Then the motor, its transmission and every passive hand behind the transmission satisfy
 
     sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = least integral of c0 v^2 + c2 a^2 over the period,
 
-with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b_max/4, the motor's displacement dx in a period, its speeds v and v+
-at the ends, dv = v+ - v, and its acceleration a. L is the least over all motions with these dx, v and v+.
-docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
+with c0 = delta - beta^2 P/4 and c2 = beta m - beta^2 b_max/4. Here dx is the motor's displacement in a period, v and v+
+are its speeds at the beginning and the end, dv = v+ - v, and a is its acceleration. L is the least integral over all
+motions with these dx, v and v+. docs/theory.md has the proof. The blocks below are positive if the environment's side
+returns less energy than L.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ from haptic_loop.design.result import (
 
 
 def shortest_period(loop: Loop) -> float | None:
-    """Return the shortest period [s] of the loop; None if T_max declares that periods vary, without a T_min."""
+    """Return the shortest period [s] of the loop. It is None if periods vary up to T_max and no T_min is declared."""
     return loop.T if loop.T_min is None and loop.T_max is None else loop.T_min
 
 
@@ -92,13 +93,13 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """Return the least beta (m,) [s] at which c0 or c2 is 0, for devices with the damping `share` times Delta."""
+    """Return the least beta (m,) [s] at which c0 or c2 is 0. The damping of the devices is `share` times Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
 
 def _shortfall(y: Array) -> Array:
-    """Return 1 - tanh(y)/y, (m,), to full relative precision also for small y."""
+    """Return 1 - tanh(y)/y, (m,), in full relative precision even for small y."""
     small = np.minimum(y, _SERIES) ** 2
     series = small * (1 / 3 - small * (2 / 15 - small * (17 / 315 - small * 62 / 2835)))
     return np.where(y < _SERIES, series, 1 - np.tanh(y) / np.maximum(y, _SERIES))
@@ -124,10 +125,10 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Matrix levels. The bounds of mass and transmission are scalars, so that an orthogonal change of a device's coordinates
-# does not change them. In coordinates with a diagonal Delta the theorem holds, with one beta for all axes of a device.
+# Matrix levels. The bounds of mass and transmission are scalars, so that a rotation of a device's coordinates does not
+# change them. Theorem B holds in coordinates with a diagonal Delta, with one beta for all axes of a device.
 
-_SKEW_BITS = 32  # fractional bits of the skew matrix S; they make Q' Delta Q diagonal to about 1e-9 of the damping
+_SKEW_BITS = 32  # fractional bits of the skew matrix S; off the diagonal Q' Delta Q is about 1e-9 of the damping
 _JACOBI_SWEEPS = 12  # Sweeps converge quadratically: 6 axes need about five.
 _BELOW = 1e-11  # relative margin of d below its exact bound, for rounding
 
@@ -141,7 +142,7 @@ def _straightened(loop: Loop) -> Loop:
 
 
 def _turned(G: Lti, loop: Loop) -> Lti:
-    """Return the map G in the coordinates of `_straightened`; inputs and outputs of walls stay as they are."""
+    """Return the map G in the coordinates of `_straightened`. Inputs and outputs of walls do not change."""
     if loop.levels is None:
         return G
     Q = np.eye(G.inputs, dtype=int).astype(object)
@@ -156,8 +157,9 @@ def _principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
     """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
 
     Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
-    Jacobi's rotations, whose additions, products and roots round alike on every machine. So every machine can check a
-    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii. Raises NotProved if an entry of d is not positive.
+    Jacobi's rotations, whose sums, products and roots are rounded alike on every machine. So every machine can check a
+    proof. d is the diagonal of Q' Delta Q minus the Gershgorin radii. Raises NotProved if an entry of d is not
+    positive.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)
@@ -188,7 +190,7 @@ _MOST_ULPS = 8  # largest distance between q and its bounds, in units in the las
 def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return decimals [s] below q(shortest period) and decimals above q(longest period), (m,) each.
 
-    q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the loop's damping. Raises NotProved if beta is not allowed.
+    q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2), for the loop's damping. Raises NotProved if beta is not allowed.
     """
     import flint
 
@@ -201,7 +203,7 @@ def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], 
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double from the ball's midpoint on, in the direction `towards`, that is `beyond` the ball."""
+    """Return the double nearest to the ball's midpoint in the direction `towards` that is `beyond` the ball."""
     import flint
 
     value = float(ball.mid())
@@ -278,14 +280,15 @@ def _exact_cost(
 # ----------------------------------------------------------------------------------------------------
 # The required damping is s Delta, with the least s for which some beta and multipliers make the block positive. The
 # bounds of mass and transmission do not scale with s. L is concave in (s, beta). The other entries are affine in beta
-# and in the multipliers, except for switching delays. Their entries are concave in beta and 1/alpha after the rows of
-# their inputs w (facts.Switching) are divided by alpha. A tangent of a concave block bounds the block from above. The
-# tangents at the binding frequencies form a linear matrix inequality, whose least s bounds the required s from below.
+# and in the multipliers, except for switching delays. The entries of switching delays are concave in beta and 1/alpha
+# after the rows of their inputs w (facts.Switching) are divided by alpha. A tangent of a concave block bounds the block
+# from above. The tangents at the binding frequencies form a linear matrix inequality. The least s that satisfies it is
+# a lower bound of the required s.
 
-_LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least tried ratio; there the requirement is about 0.1 % below that for beta -> 0
+_LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, at which c0 or c2 is 0
+_LEAST_ETA = 1e-5  # least tried ratio; its requirement is about 0.1 % below the limit of the requirement for beta -> 0
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
-_TOGETHER = 100  # A stack of this many matrices takes hardly longer than one, so a step tries up to 31 shares at once.
+_TOGETHER = 100  # A stack of this many matrices takes hardly longer than one matrix. So a step tries up to 31 shares.
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
 _VIOLATED = 3  # largest number of local minima at which `_Search.cut` adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
@@ -307,13 +310,13 @@ class _Best(NamedTuple):
 class Sweep:
     """The block of Theorem B in the environments of `loop`, for sweeps over frequency.
 
-    The block without L is independent of the share of the damping; L is added for each share.
+    The block without L does not depend on the share of the damping. L is added for each share that is tried.
 
     Args:
         maps: One map for each environment, as `form` takes them.
         form: (map, multipliers by name, hands' side) -> the demand.
         unknowns: The multipliers of the facts.
-        limited: Whether a limiter is among the facts, so that dx is the sum of two inputs.
+        limited: Whether a limiter is among the facts. Then dx is the sum of two inputs.
     """
 
     def __init__(
@@ -338,13 +341,13 @@ class Sweep:
         return self.form(self.maps[environment], named, KnownMotor(PeriodCost(*np.zeros((4, len(beta)))), beta))
 
     def floor(self, beta: Array) -> float:
-        """Return the least share whose largest beta, times _LARGEST_ETA, is at least beta; inf if there is none."""
+        """Return the least share for which beta is allowed, that is at most _LARGEST_ETA `largest_beta`, or inf."""
         if not ((beta > 0) & (beta <= _LARGEST_ETA * self.highest)).all():
             return np.inf
         return float((beta**2 * self.P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
 
     def holds(self, idle: Complex, z: Complex, share: Any, beta: Array) -> NDArray[np.bool_]:
-        """Return whether the block with the L of this share of the damping is positive at each frequency, (k,)."""
+        """Return whether the block, with L for this share of the damping, is positive at each frequency, (k,)."""
         return positive(_with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
     def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
@@ -376,7 +379,7 @@ class Sweep:
         return shares
 
     def required(self, beta: Array, high: float, values: Sequence[float] | None = None) -> tuple[float, float]:
-        """Return the least share up to `high` (inf if there is none) by a refined sweep, and its frequency."""
+        """Return the least share up to `high`, or inf, by a refined sweep, and the binding frequency [rad/sample]."""
         if not self.floor(beta) < high:
             return np.inf, 0.0
         return max(supremum(self.response(i, beta, values, high), grid) for i, grid in enumerate(self.grids))
@@ -443,7 +446,7 @@ class _Search:
         return tuple(values.tolist())
 
     def idle(self, z: Complex, parts: Complex, x: Array) -> Complex:
-        """Return the block (k, n, n) without L at x; for switching delays it is not affine in (alpha, beta)."""
+        """Return the block (k, n, n) without L at x. For switching delays it is not affine in (alpha, beta)."""
         m, beta, weights = self.device.size, self.beta(x), self.weights(x)
         block = parts[0] + np.tensordot(np.concatenate([x[: self.m], weights]), parts[1:], axes=1)
         alpha, loop = named_parts(self.sweep.unknowns, self.values(x)).get("alpha"), self.sweep.loop
@@ -458,7 +461,7 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n) with L, where inputs of switching delays are scaled by x/at to make it concave."""
+        """Return the block (k, n, n) with L. Inputs of switching delays are scaled by x/at, which makes it concave."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = _with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:  # 1/alpha
@@ -485,7 +488,7 @@ class _Search:
     def least(self, x: Array, most: float) -> tuple[float, tuple[int, int] | None]:
         """Return the least share below `most` at x, or inf, and (environment, index of the binding frequency).
 
-        The second is None if the share is inf or `Sweep.floor`.
+        The second result is None if the share is inf or `Sweep.floor`.
         """
         beta, share, binding = self.beta(x), self.sweep.floor(self.beta(x)), None
         for e, (z, parts) in enumerate(self.sampled):
@@ -513,7 +516,7 @@ class _Search:
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
     def run(self) -> _Best:
-        """Add cuts until the bound is within _GAP of the least share; return the best result of a refined sweep."""
+        """Return the best result of a refined sweep, after cuts that bring the bound within _GAP of the least share."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
@@ -560,14 +563,14 @@ class _Search:
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
 
     def cut(self, x: Array, binding: tuple[int, int] | None = None) -> None:
-        """Add the tangent at x for `binding`, an (environment, index of a frequency); None adds those of `lowest`."""
+        """Add the tangent at x for `binding`, (environment, index of a frequency); None stands for all of `lowest`."""
         places = [binding] if binding else self.lowest(x)
         for e, at in places:
             z, parts = self.sampled[e]
             self.tangents.append(self.tangent(z[at : at + 1], parts[:, at : at + 1], x))
 
     def lowest(self, x: Array) -> list[tuple[int, int]]:
-        """Return (environment, index of the frequency) of the _VIOLATED least local minima of `room`."""
+        """Return (environment, index of the frequency) of up to _VIOLATED local minima of `room`, the least ones."""
         minima = []
         for e, (z, parts) in enumerate(self.sampled):
             room = self.room(z, parts, self.idle(z, parts, x), x)
@@ -605,11 +608,11 @@ class _Search:
 
 _ETAS = (0.03, 0.3, 0.1, 0.9)  # shares of the largest beta for the first tangents; the search begins at the second
 _SLACK = 0.002  # A tangent with a larger least eigenvalue (its entries are about one) is dropped.
-_BETWEEN = 1e-4  # If a sweep finds a share larger by more than this (relative), its frequency is sampled, too.
+_BETWEEN = 1e-4  # If a refined sweep finds a share that is larger by more than this, its frequency is sampled, too.
 
 
 def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
-    """Return the entry 11, twice the entry 21, and the entry 22 of the form L on (dx, v) at z (k,)."""
+    """Return the entry 11, twice the entry 21, and the entry 22 of L as a Hermitian matrix on (dx, v), at z (k,)."""
     turn, cosine = 1 + 1 / z[:, None], z.real[:, None]
     return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
 
@@ -652,14 +655,15 @@ _MOST_SHARE = 1e3  # largest share of the damping that `required` tries
 class KnownDevice(Condition):
     """Stability in the environment of the loop for every passive hand, on devices within their guaranteed bounds.
 
-    The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number each per channel, and of
-    the facts' multipliers. The first three are 0 if the condition `plain`, which ignores the device bounds, requires
-    less damping. The bounds of q are also 0 if the damping does not suffice, because then no proof needs them.
+    The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number of each per channel, and
+    of the facts' multipliers. The condition `plain` ignores the bounds of the devices. If it requires less damping,
+    beta and the bounds of q are 0. The bounds of q are also 0 if the damping does not suffice, because no proof needs
+    them.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
     covers = ("psi", "T_max", "varying_delay", "walls", "ranges")
-    plain: Multiplied = THIS_ENVIRONMENT  # the condition with the same facts for beta -> 0
+    plain: Multiplied = THIS_ENVIRONMENT  # the limit of the condition for beta -> 0, with the same facts
 
     def beyond(self, loop: Loop) -> str | None:
         if loop.latency:  # This reason comes first, because declaring bounds does not remove it.
@@ -673,7 +677,7 @@ class KnownDevice(Condition):
 
     @property
     def at_zero(self) -> Multiplied:
-        """The condition for beta -> 0: `plain`, with this class's facts if a user's subclass replaces them."""
+        """The limit of the condition for beta -> 0: `plain`, but with the facts of a user's subclass."""
         if type(self).facts is KnownDevice.facts:
             return self.plain
         base, own, extended = type(self.plain), copy(self.plain), {"name": self.name, "covers": BEYOND}
@@ -707,7 +711,7 @@ class KnownDevice(Condition):
         return Sweep(_straightened(one), maps, form, self.unknowns(loop), limited)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the demand at the loop's damping; for beta > 0 `gain` is 0, as L is not proportional to damping."""
+        """Return the demand at the loop's damping. If beta > 0, `gain` is 0, as L is not proportional to damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m, straight = loop.channels, _straightened(loop)
@@ -731,7 +735,7 @@ class KnownDevice(Condition):
         return self.form(G, loop, values, hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with the best beta and multipliers, the same in all members, or with `multiplier`."""
+        """Return the requirement with `multiplier`; None means the best one that serves all environments in ranges."""
         if reason := self.beyond(loop) or self.without(coupling):
             return refusal(self.name, loop.delta, reason, applies=False)
         m, expected = loop.channels, sum(self.multiplier_sizes(loop).values())
@@ -792,9 +796,9 @@ class KnownDevice(Condition):
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid of frequencies.
 
-        Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
-        beta = _DRAWN times the largest beta of each channel. Returns None for matrix levels, for a user's subclass, or
-        if the plain condition returns None, and inf if this condition does not cover the loop or has multipliers.
+        The tried shares lie between _LEAST_DRAWN and the smaller of _MOST_DRAWN and the share of `plain`. The tried
+        beta are _DRAWN times the largest beta of each channel. Returns None for matrix levels, for a user's subclass,
+        or if `plain` returns None. Returns inf if the condition does not cover the loop or has multipliers.
         """
         ours = type(self) in (KnownDevice, _KnownDeviceAny)  # The block of a user's fact may not be affine in beta.
         plain = self.plain.ratios(loop, coupling) if ours and not loop.levels else None
@@ -810,7 +814,7 @@ class KnownDevice(Condition):
         return np.minimum(np.where(enough, high, plain), plain)
 
     def _drawn(self, loop: Loop, coupling: Coupling, n: int) -> Callable[[Array], NDArray[np.bool_]]:
-        """Return the function: shares (n,) -> whether some beta of _DRAWN satisfies the block of each coupling (n,)."""
+        """Return the function: shares (n,) -> whether some beta of _DRAWN makes each coupling's block positive (n,)."""
         half, m = _DRAWN_POINTS // 2, loop.channels
         w = np.sort(np.concatenate([np.geomspace(1e-3, np.pi, half), np.linspace(0.011, np.pi, half)]))
         z, none = on_circle(w), PeriodCost(*np.zeros((4, m)))
