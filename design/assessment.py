@@ -628,17 +628,17 @@ def assess(
     Args:
         loop: The loop, with its ranges, switching delays, latency and longest period.
         coupling: The coupling as it runs. A Chosen or a Design also supplies its condition, its certificates, its
-            search between the vertices of ranges, and the multipliers `c` of its limiter. If these do not cover limited
-            forces in this loop, others are searched.
+            search between the vertices of ranges, and the multipliers `c` of its limiter. If the limiter is not covered
+            in this loop, other multipliers are searched.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
         energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
             world. Without a shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
-        certificate: A stored proof. It counts only if it holds for exactly this loop and coupling; it is verified
-            unless this process has made or verified it.
+        certificate: A stored proof, which is ignored unless it is for exactly this loop and coupling and holds. The
+            proof is verified unless this process has made or verified it.
         condition: The name of the condition that must hold, or a user's own condition. The default is this-environment,
-            or known-device if the loop has bounds of its devices. With a user's own condition, no other gives the
-            guarantee.
+            or known-device if the loop has bounds of its devices. With a user's own condition, no other
+            condition gives the guarantee.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
         limiter: False to clip forces even if a condition covers a limiter.
@@ -647,8 +647,8 @@ def assess(
 
     Returns:
         The assessment. Its guarantee is for the environment that runs. `holds` also requires `condition` and, with
-        ranges, a guarantee that covers them. A loop has exact positions and loses no packets; `simulate` and the
-        commands qualify the assessment by the scenario's encoder steps and lost packets.
+        ranges, a guarantee that covers the ranges. A loop has exact positions and loses no packets; `simulate` and the
+        commands add the encoder steps, lost packets and force limits of a scenario.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -689,7 +689,8 @@ def assess(
         ranges = replace(ranges, certificate=None, reason=own.beyond(loop))
     if limiter_proof is None and known and known.limiter:
         limiter_proof = known.limiter
-    plugged = shelled(network if environment is None else environment)
+    running = network if environment is None else environment
+    plugged = shelled(running)
     if plugged:
         limits = ForceLimits(None, "the forces of the environment are clipped before the shell")
     elif limiter is False:
@@ -706,7 +707,7 @@ def assess(
         loop,
         coupling,
         requirements,
-        network if environment is None else environment,
+        running,
         ranges,
         limits,
         _transparency(here, coupling, band_hz),

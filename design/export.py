@@ -348,7 +348,7 @@ def _block_of_balls(
             best = worst
         x = _in_order([q, *(M * ((2 * f - u) / tau)).T])
         back = _in_order([u - f, *(resolvent * x).T])  # the step of Douglas and Rachford
-        slope = np.where(share < 1, share * (eye - np.outer(normal, normal)), eye)  # of f in u, for each vector
+        slope = np.where(share < 1, share * (eye - np.outer(normal, normal)), eye)  # slope of f over u
         rows = np.zeros((n, n + 1), real)  # the equations of Newton's step
         for own in vectors:
             for k in range(own.start, own.stop):

@@ -81,7 +81,7 @@ def test_an_energy_account_covers_no_latency():
 
 @pytest.mark.slow
 def test_the_limiter_is_judged_with_switching_delays():
-    """The limiter needs 0.70 of the damping with constant delays, and 1.04 of it if they switch."""
+    """The limiter needs 0.70 of the damping with constant delays, and 1.04 with delays that switch."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
     limits = assess(loop, coupling, environment=loop.environment).force_limits
     assert limits.rho is None

@@ -167,7 +167,7 @@ def test_stiffest_axes_of_late_devices_hold_together():
 @pytest.mark.validate
 @pytest.mark.parametrize("B", [0.62, 0.85, 0.899])
 def test_the_stiffest_gains_of_late_forces_are_certified(B):
-    """For large B no K is certified although B < delta, and a K near 0 may need more damping than a larger one."""
+    """For large B no K is certified although B < delta, and a K near 0 may need more damping than a larger K."""
     loop, coupling = wall(100, B, theta=1, delta=0.9)
     loop = msgspec.structs.replace(loop, latency=((0.0, 9e-4),))
     margin = stiffest(loop, coupling, "any-environment")
@@ -202,7 +202,7 @@ def test_the_papers_gains_are_not_certified():
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
 def test_certification_ends_at_the_reported_edges(subject, condition):
-    """An edge errs by at most 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond it."""
+    """An edge errs by at most 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond an edge."""
     loop, coupling = subject
     needs = required_damping(loop, coupling, condition)
     assert needs.certified
@@ -491,7 +491,7 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 
 
 def test_long_computations_are_refused_or_ended(monkeypatch):
-    """A sweep of the pair is estimated at 0.16 ms, and a search at sixty times as much."""
+    """A sweep of the pair is estimated at 0.16 ms, and a search at sixty sweeps."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
     outcome = report(PAIR, SOFT)
     part, need = outcome["margins"]["this-environment"], needs(outcome, "this-environment")

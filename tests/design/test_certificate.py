@@ -344,8 +344,8 @@ def test_the_bound_on_rounding_holds_over_ticks():
 def test_proof_and_run_agree_near_sharp_resonances():
     """The responses of the float and the rational loop are computed exactly at a point of the circle near a sharp peak.
 
-    The rational loop's response in floating point errs by more than they differ. `rounding` still bounds their
-    difference, and the filter is proved.
+    The rational loop's response in floating point has an error above the difference of the two loops. `rounding` still
+    bounds this difference, and the filter is proved.
     """
     springs = (("a", "m", 1000.0, 0.01), ("m", "n", 100.0, 0.0), ("n", "k", 1000.0, 0.0), ("k", "b", 3000.0, 0.01))
     parts = tuple(Spring((one, other), stiffness, damping) for one, other, stiffness, damping in springs)

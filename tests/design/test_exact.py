@@ -262,7 +262,7 @@ def test_the_kyp_form_is_supply_less_storage_increase():
 
 @pytest.mark.parametrize(("bits", "finer"), [(16, 16), (32, 16), (48, 112), (192, 192)])
 def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
-    """The integer matrix is within its bound of the exact matrix of the rounded P, whatever the units are."""
+    """The integer matrix differs from the exact one by at most its bound, in any units of states and channels."""
     rng, fullest = np.random.default_rng(16), 0.0
     for _ in range(12):
         n, m = 5, 2

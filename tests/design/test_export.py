@@ -237,7 +237,7 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_export_and_simulator_differ_by_rounding(data):
-    """BLAS sums in any order: export and simulator err by at most gamma_N |row| |v| per tick, and A propagates it."""
+    """BLAS sums in any order: export and simulator err by at most gamma_N |row| |v| per tick; A carries errors on."""
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
@@ -293,7 +293,7 @@ def test_single_precision_repeats_its_own_test_vector(limited_files, name, limit
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_single_precision_stays_within_its_error_bound(data):
-    """Coefficients, inputs and sums are rounded to 2^-24: a row errs by gamma_(N+2) |row| |v|; A propagates it."""
+    """Coefficients, inputs and sums are rounded to 2^-24: a row errs by gamma_(N+2) |row| |v|; A carries errors on."""
     block = process_block(Stored.of(PAIR, data))
     G, inputs = block.system, trial(block).inputs
     single, double = _sequential(G, inputs, dtype=np.float32), _sequential(G, inputs)
