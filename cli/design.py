@@ -179,7 +179,10 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 
 
 def _begun_bound(args: argparse.Namespace, loop: Loop) -> Forked[Bound] | None:
-    """Begin to compute the bound on optimal couplings, which depends on the loop and the band alone, or return None."""
+    """Begin to compute the bound on optimal couplings, and return this computation; None if there is no bound.
+
+    The bound depends on the loop and the band alone.
+    """
     if args.coupling != "optimal" or args.condition == "known-device":
         return None
     from haptic_loop.design.bound import MOST, bound

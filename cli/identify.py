@@ -163,7 +163,7 @@ def _sitting(
     number: int,
     clamped: float | None = None,
 ) -> _Sitting:
-    """Apply the exciting forces to every axis, record its motion, and estimate its parameters.
+    """Run a session that excites every axis, and return its record with the estimated parameters.
 
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
@@ -231,7 +231,7 @@ def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
 def _with_transmissions(
     report: _Report, scenario: Scenario, sittings: list[_Sitting], clamped: list[_Sitting]
 ) -> _Report:
-    """Add bounds of every motor and transmission to the report, or the reason why there are none."""
+    """Return the report with bounds of every motor and transmission, or with the reason why there are none."""
     if reason := "; ".join(sitting.reason for sitting in clamped if sitting.reason):
         return replace(report, no_transmissions=reason)
     bounds = list[TransmissionBounds]()

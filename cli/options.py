@@ -142,7 +142,7 @@ class Parser(argparse.ArgumentParser):
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)
-        paper = "the paper's name for the reference (I, II) or for --coupling none (none)"
+        paper = "the paper's cases: I and II choose --reference, none is --coupling none"
         loop.add_argument("--case", choices=CASES, help=paper)
         names = ", ".join(built_in())
         loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"a file, or one of: {names}")
@@ -203,7 +203,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
-        what = "scale forces: no passive hand gets over W0 [J] more than devices dissipate; CAP [J] limits the budget"
+        what = "scale forces: passive hands get at most W0 [J] beyond what devices dissipate; CAP [J] limits the budget"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:
@@ -245,7 +245,7 @@ class Parser(argparse.ArgumentParser):
             output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=drawn)
 
     def add_details(self) -> None:
-        what = "also print what no certificate covers; of a run also its speed and position error"
+        what = "also print what no certificate covers, and for a run its speed and position error"
         self.add_argument("--details", action="store_true", help=what)
 
     def add_json(self, to: _Group | None = None) -> None:

@@ -153,7 +153,10 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robustness | None] | None:
-    """Begin to compute the damping needed in environments near the model; None if no guarantee depends on the model."""
+    """Begin to compute the damping needed in environments near the model, and return this computation.
+
+    Return None if no guarantee depends on the model.
+    """
     from haptic_loop.design.coverage import robustness_nearby
 
     guarantee = assessment.guarantee

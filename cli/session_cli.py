@@ -226,7 +226,7 @@ def host_clocked(args: argparse.Namespace) -> bool:
 
 @dataclass(frozen=True)
 class _Held:
-    """Signals that arrived during the session, and the number of bytes that the ports did not accept."""
+    """The signals that arrived during a session, and the number of bytes that the ports did not accept."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -240,7 +240,7 @@ def hold_session(
     out: Path,
     emulated: Scenario | None = None,
 ) -> _Held:
-    """Run a session from opening the port to its end, or in virtual time with an emulated device.
+    """Run a session from opening the port to its end, or in virtual time; return its signals and lost bytes.
 
     `emulated` is the scenario of the emulated device; None for that of the options.
     """

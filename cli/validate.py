@@ -105,7 +105,7 @@ def _parser() -> options.Parser:
     many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
     add("--humans", type=whole_number(1, 1_000_000), metavar="N", help=many)
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: as in the scenario); mixed: 1 or 2")
-    add("--engine", choices=ENGINES, default="both", help="engines that judge; mujoco means both (default both)")
+    add("--engine", choices=ENGINES, default="both", help="engines that judge hands; mujoco means both (default both)")
     seconds = "length of the traces [s] (default 2; 0: no traces)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
     traced = "hands that MuJoCo also simulates: all, or sampled (default): nearest to instability, lossless, 64 random"

@@ -30,7 +30,10 @@ def assessment_of(
     environment: Environment | None = None,
     energy_budget: float | None = None,
 ) -> Assessment:
-    """Assess the coupling in the scenario's loop; `environment` replaces the scenario's in the run."""
+    """Return the assessment of a coupling in the scenario's loop.
+
+    `environment` replaces the scenario's environment in the run.
+    """
     ranges = scenario.loop(args.case).ranges
     with render.progress("searching the ranges" if ranges else "proving the conditions") as move:
         return assessed(
