@@ -74,7 +74,7 @@ def check_loop(loop: Loop) -> None:
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
 
 #: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device's values.
-_STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
+_STIFFEST, _LONGEST_PERIOD, _MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
 _SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; larger ones may be a jump.
@@ -184,7 +184,7 @@ def _sensitivity(loop: Loop, coupling: Coupling, condition: Condition, needs: Re
     )
     reasons = [
         tried if largest is None else "",
-        f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
+        f"certified with {_MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
     error = None if largest is None else largest / loop.T - 1
     of_delta = _of_delta(needs, "; ".join(filter(None, reasons)) or None)
@@ -215,8 +215,8 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
 
 
 def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
-    """Return the largest certified increase of theta, or None if MOST_EXTRA_SAMPLES more are still certified."""
-    for extra in range(1, MOST_EXTRA_SAMPLES + 1):
+    """Return the largest certified increase of theta, or None if _MOST_EXTRA_SAMPLES more are still certified."""
+    for extra in range(1, _MOST_EXTRA_SAMPLES + 1):
         later = tuple(n + extra for n in loop.theta)
         if not _varied(loop, coupling, condition, theta=later).certified:
             return extra - 1

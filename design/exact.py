@@ -25,15 +25,15 @@ _Integers = NDArray[np.object_]
 
 
 @dataclass(frozen=True, eq=False)
-class Matrix:
+class _Matrix:
     """The rational matrix `num / den`, with integer entries and one positive denominator."""
 
     num: _Integers  # (p, m), Python integers
     den: int = 1
 
     @classmethod
-    def of(cls, rows: Any, shape: Any = None) -> Matrix:
-        """Convert rows of floats (read as decimals), integers, fractions or strings "p/q" to a Matrix of this shape."""
+    def of(cls, rows: Any, shape: Any = None) -> _Matrix:
+        """Convert rows of floats (read as decimals), integers, fractions or strings "p/q" to a matrix of this shape."""
         entries = fractions(rows)
         den = math.lcm(*(v.denominator for v in entries.ravel()))
         num = np.vectorize(lambda v: v.numerator * (den // v.denominator), otypes=[object])(entries)
@@ -110,12 +110,12 @@ _FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; 
 _GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
-def _halves(S: Matrix) -> list[int]:
+def _halves(S: _Matrix) -> list[int]:
     """Return an exponent of two per row. Rows and columns divided by these powers give S a diagonal near one."""
     return [(int(v).bit_length() - S.den.bit_length()) // 2 for v in np.diag(S.num)]
 
 
-def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
+def _rounded(S: _Matrix, half: Sequence[int], bits: int) -> _Integers:
     """Return S with row and column i divided by 2^half[i], rounded to integers in units of 2^-bits."""
     n = S.shape[0]
     rounded = np.empty((n, n), dtype=object)
@@ -222,7 +222,7 @@ _MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of `_kyp_matri
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
 
-def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
+def _kyp_matrix(G: Lti, P: _Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
     """Return the matrix of (KYP) in units of u = 2^-finer, and a bound on the norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
@@ -233,7 +233,7 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     this bound in floating point.
     """
     n, m = G.B.shape
-    state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
+    state, channel = _halves(P), _halves(_Matrix.of(G.D + G.D.T))
 
     def rounded(part: Any, rows: Sequence[int], columns: Sequence[int]) -> _Integers:
         numbers = np.zeros(part.shape, dtype=object)
@@ -259,7 +259,7 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     return W >> bits + finer, 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
 
 
-def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
+def _prove_positive_real(G: Lti, P: _Matrix) -> str | None:
     """Return None if P proves that G is strictly positive real, else the reason. Floating point can only refuse."""
     n = G.order
     if P.shape != (n, n):
@@ -280,7 +280,7 @@ def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
     return f"{at_fault} is not positive definite, or too close to singular for a proof"
 
 
-def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
+def _refuted_in_floating_point(G: Lti, P: _Matrix) -> bool:
     """Return whether a direction makes the KYP matrix negative by more than every rounding error.
 
     The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B]. Its entries are sums of products of three
@@ -306,7 +306,7 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     return bool(x @ M @ x < -2 * bound)
 
 
-def reached(G: Lti) -> Lti:
+def _reached(G: Lti) -> Lti:
     """Return the same map without the states that stay zero because, by the pattern of A and B, no input moves them."""
     reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
@@ -324,10 +324,10 @@ class Violated(str):
 _CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the scaled block has ones on the diagonal of D.
 
 
-def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
+def find_storage(G: Lti) -> tuple[_Matrix | None, str | None]:
     """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
-    P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
+    P is over the states that an input reaches (`_reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation has an
     added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. Up to three attempts solve the equation:
      1. in coordinates in which white noise at the inputs moves all states equally and independently, because P is
@@ -338,7 +338,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
-    G = reached(G)
+    G = _reached(G)
     parts, half = _scaled(G)
     block = _double(parts)
     margin, w = _least_eigenvalue(block)
@@ -346,7 +346,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
         kind = Violated if margin < -_CLEARLY else str
         return None, kind(f"the condition is violated at {w:.6g} rad/sample")
     if G.order == 0:
-        empty = Matrix(np.zeros((0, 0), dtype=object))
+        empty = _Matrix(np.zeros((0, 0), dtype=object))
         reason = _prove_positive_real(G, empty)
         return None if reason else empty, reason
     reason = None
@@ -474,7 +474,7 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
     raise np.linalg.LinAlgError("doubling did not converge")
 
 
-def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
+def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> _Matrix:
     """Return out' P out with row i and column i divided by 2^half[i]. Only `out` and P are rounded."""
 
     def integers(a: Array) -> tuple[_Integers, int]:
@@ -485,7 +485,7 @@ def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
     return _divided(_congruence(left, middle), half, 2 * one + other)
 
 
-def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> Matrix:
+def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> _Matrix:
     """Return numbers/2^power in lowest terms, with row i and column i divided by 2^half[i] for all i."""
     most = int(max(half))
     for i, row in enumerate(numbers):
@@ -493,12 +493,12 @@ def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power:
             row[j] <<= 2 * most - int(half[i]) - int(half[j])
     power += 2 * most
     if power < 0:
-        return Matrix(numbers << -power)
+        return _Matrix(numbers << -power)
     common = math.gcd(1 << power, *numbers.ravel())
-    return Matrix(numbers // common, (1 << power) // common)
+    return _Matrix(numbers // common, (1 << power) // common)
 
 
-def _shortened(P: Matrix) -> Matrix:
+def _shortened(P: _Matrix) -> _Matrix:
     """Return P rounded to _STORED_BITS relative to its diagonal; unchanged if the diagonal is not positive."""
     if any(v <= 0 for v in np.diag(P.num)):
         return P
@@ -509,14 +509,14 @@ def _shortened(P: Matrix) -> Matrix:
 _Rows = tuple[tuple[str, ...], ...]
 
 
-def rows_of(M: Matrix) -> _Rows:
+def rows_of(M: _Matrix) -> _Rows:
     """Return every entry as a text "p/q" in lowest terms, or "p" for an integer."""
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Return the reason why the named matrix does not prove that the block is strictly positive real, or None."""
-    block = reached(block)
+    block = _reached(block)
     n = block.order
     if len(rows) != n:
         return f"{name} has {len(rows)} rows, the block has {n} states"
@@ -528,7 +528,7 @@ def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | 
             common = math.lcm(common, int(value.partition("/")[2] or 1))
             if common.bit_length() > _MOST_BITS:
                 return f"{name} has a common denominator of more than {_MOST_BITS} bits: testing it would take minutes"
-        P = Matrix.of(rows, (n, n))
+        P = _Matrix.of(rows, (n, n))
     except (ValueError, ZeroDivisionError) as error:
         return f"{name} has an entry that is not a rational number: {error}"
     try:

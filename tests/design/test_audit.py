@@ -22,7 +22,7 @@ from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import budgets, certificate, coupling_file
 from haptic_loop.design.api import certify
 from haptic_loop.design.assessment import assess
-from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _helps, _sensitivity, _stiffest, audit, edge
+from haptic_loop.design.audit import _MOST_EXTRA_SAMPLES, _helps, _sensitivity, _stiffest, audit, edge
 from haptic_loop.design.certificate import named, required_damping
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import ANY, CAVEATS, GUARD, HERE, suffices
@@ -230,7 +230,7 @@ def test_figures_that_do_not_exist_have_a_reason():
     spring = wall(0.01, 0.0, delta=1.0)
     edges = sensitivity(*spring, "this-environment")
     assert (edges.largest_T_s, edges.extra_samples) == (None, None)
-    assert f"{MOST_EXTRA_SAMPLES} samples more" in edges.reason
+    assert f"{_MOST_EXTRA_SAMPLES} samples more" in edges.reason
     assert "largest T tried" in edges.reason
     assert "multiple of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason

@@ -15,11 +15,11 @@ from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import budgets, exact
 from haptic_loop.design.exact import (
-    Matrix,
+    _Matrix,
     _prove_positive_real,
+    _reached,
     find_storage,
     negative_minor,
-    reached,
     refuted_rows,
     rows_of,
 )
@@ -61,7 +61,7 @@ def test_a_float_counts_as_its_shortest_decimal():
 
 def rounded_proof(S: np.ndarray, bits: int = 192) -> bool:
     """Return whether S (n, n), rounded to multiples of 2^-bits of its diagonal, is proved to be positive definite."""
-    P, n = Matrix.of(S), len(S)
+    P, n = _Matrix.of(S), len(S)
     if any(v <= 0 for v in np.diag(P.num)):
         return False
     return exact._definite(exact._less(exact._rounded(P, exact._halves(P), bits), n), bits)
@@ -209,24 +209,24 @@ def test_exact_delays_and_sums_equal_the_running_ones():
 def test_a_wrong_storage_matrix_proves_nothing():
     # G = 1 + 0.5/(z - 0.5): He G >= 2/3 on the circle
     G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
-    assert _prove_positive_real(G, Matrix.of([["1/2"]])) is None
-    assert re.search("KYP|negative", _prove_positive_real(G, Matrix.of([[5]])))
+    assert _prove_positive_real(G, _Matrix.of([["1/2"]])) is None
+    assert re.search("KYP|negative", _prove_positive_real(G, _Matrix.of([[5]])))
     # with P = 1 the matrix is diag(3/4, 2 D - 1): floating point cannot tell its entry of 2e-30 from zero
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
-        refusal = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
+        refusal = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), _Matrix.of([[1]]))
         assert refusal is reason or refusal.startswith(reason)
     zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # with P = 1 the KYP matrix is exactly zero
-    assert _prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
+    assert _prove_positive_real(zero, _Matrix.of([[1]])).startswith("the KYP matrix is not positive")
     # An unstable block may have a positive KYP matrix with P < 0; only the inequality P > 0 refuses it.
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
-    assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
+    assert _prove_positive_real(unstable, _Matrix.of([[-1]])) == (
         "P is not positive definite, or too close to singular for a proof"
     )
     # D + D' = 0, and the input moves no state: no P can prove it
     still = Lti(*([[Fraction(v)]] for v in ("1/2", "0", "0", "0")), Fraction(1))
-    assert _prove_positive_real(still, Matrix.of([[1]])).startswith("D + D' is not positive definite")
+    assert _prove_positive_real(still, _Matrix.of([[1]])).startswith("D + D' is not positive definite")
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
-    assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the block has 1 states"
+    assert _prove_positive_real(G, _Matrix.of(np.eye(2))) == "P has shape (2, 2), the block has 1 states"
 
 
 def random_exact(rng: np.random.Generator, n: int, m: int) -> Lti:
@@ -271,8 +271,8 @@ def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
         G, half = random_exact(rng, n, m), rng.integers(-9, 10, (n, n)) + 9 * np.eye(n, dtype=int)
         D = G.D + 3 * np.eye(m, dtype=int)
         G = Lti(states @ G.A @ back, states @ G.B @ channels, channels @ G.C @ back, channels @ D @ channels, G.T)
-        P = Matrix.of(back @ (half @ half.T) @ back / 7)
-        row, column = exact._halves(P), exact._halves(Matrix.of(G.D + G.D.T))
+        P = _Matrix.of(back @ (half @ half.T) @ back / 7)
+        row, column = exact._halves(P), exact._halves(_Matrix.of(G.D + G.D.T))
         size = np.diag([Fraction(2) ** h for h in row])
         rounded = size @ exact._rounded(P, row, bits) @ size * Fraction(1, 2**bits)
         integers, most = exact._kyp_matrix(G, P, bits, finer)
@@ -292,7 +292,7 @@ def test_exact_arithmetic_alone_refuses_wrong_storage_matrices(monkeypatch):
     low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
     for p, expected in ((low, (False, True)), (high, (True, False))):
         for factor, proved in zip((1 - 1e-9, 1 + 1e-9), expected, strict=True):
-            refusal = _prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
+            refusal = _prove_positive_real(G, _Matrix.of([[Fraction(p * factor)]]))
             assert (refusal is None) == proved
 
 
@@ -302,7 +302,7 @@ def test_floating_point_refuses_no_definite_matrix():
     for _ in range(60):
         n = int(rng.integers(2, 6))
         half = rng.normal(size=(n, n)) @ np.diag(10.0 ** rng.uniform(-3, 0, n)) * 10.0 ** rng.uniform(-3, 3, n)[:, None]
-        P = Matrix.of(np.vectorize(Fraction, otypes=[object])(half @ half.T))
+        P = _Matrix.of(np.vectorize(Fraction, otypes=[object])(half @ half.T))
         r = Fraction(1) - Fraction(1, 2 ** int(rng.integers(44, 53)))
         eye, zero = numbers(np.eye(n), Fraction(1)), numbers(np.zeros((n, 1)), Fraction(1))
         G = Lti(r * eye, zero, zero.T, numbers([[1]], Fraction(1)), Fraction(1))
@@ -317,13 +317,13 @@ def test_unreachable_states_are_left_out():
     A = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [1, -1, 0.2, 0], [0, 0, 0.3, 0.1]]
     B, C = [[1], [1], [0], [0]], [[0.1, 0, 0.1, 0.1]]
     G = Lti(*(numbers(part, Fraction(1)) for part in (A, B, C, [[1]])), Fraction(1))
-    assert reached(G) is G
+    assert _reached(G) is G
     P, reason = find_storage(G)  # the first two states are equal, and cancel in the third
     assert reason is None
     assert P.shape == (4, 4)
     late = Lti(G.A.T, numbers([[0], [0], [1], [0]], Fraction(1)), G.C, G.D, Fraction(1))
-    assert reached(late).order == 3
-    np.testing.assert_allclose(at(reached(late), 1.3j), at(late, 1.3j), rtol=1e-12)
+    assert _reached(late).order == 3
+    np.testing.assert_allclose(at(_reached(late), 1.3j), at(late, 1.3j), rtol=1e-12)
     P, reason = find_storage(late)
     assert reason is None
     assert refuted_rows("P", late, rows_of(P)) is None
@@ -342,8 +342,8 @@ def test_a_wrong_riccati_solution_proves_nothing(monkeypatch):
 
 def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
-    assert _prove_positive_real(G, Matrix.of([[1]])) is None
-    assert _prove_positive_real(G, Matrix.of([[-1]])) is not None
+    assert _prove_positive_real(G, _Matrix.of([[1]])) is None
+    assert _prove_positive_real(G, _Matrix.of([[-1]])) is not None
     assert not recwarn.list
 
 

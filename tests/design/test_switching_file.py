@@ -28,7 +28,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from haptic_loop.design.environments import SWITCHING
-from haptic_loop.design.exact import Matrix
+from haptic_loop.design.exact import _Matrix
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import RANGES, NotProved, switching_guarantee
@@ -85,7 +85,7 @@ def test_stored_multipliers_pass_a_dense_sweep(stored):
     )
     assert np.linalg.eigvalsh(hermitian(demand.free.G + demand.gain.G)).min() > 0
     G = exact_block(LOOP, SOFT, proof.multipliers["alpha"])
-    F, S = G.floats(), Matrix.of(proof.matrices["P"]).floats()
+    F, S = G.floats(), _Matrix.of(proof.matrices["P"]).floats()
     A, B, C, D = F.A, F.B, F.C, F.D
     kyp = np.block([[S - A.T @ S @ A, (C - B.T @ S @ A).T], [C - B.T @ S @ A, D + D.T - B.T @ S @ B]])
     scale = 1 / np.sqrt(np.diag(kyp))
