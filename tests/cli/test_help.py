@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from forked import run
 
 from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
@@ -115,10 +114,14 @@ def test_commands_and_functions_use_one_blas_thread(call):
 
 
 def test_the_console_script_lists_and_runs_commands():
-    listed = run("python -m cli", ROOT).stdout
+    def script(*words):
+        start = [sys.executable, "-c", "from haptic_loop.cli.main import main; main()", *words]
+        return subprocess.run(start, cwd=ROOT, capture_output=True, text=True, check=False)
+
+    listed = script().stdout
     assert all(f"({module})" in listed for module in modules())
-    assert run("python -m cli check --help", ROOT).stdout.startswith("usage: python -m design.check")
-    unknown = run("python -m cli chekc", ROOT)
+    assert script("check", "--help").stdout.startswith("usage: python -m design.check")
+    unknown = script("chekc")
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert unknown.stderr == "error: unknown command 'chekc', did you mean check?\n"
-    assert run("python -m cli --version", ROOT).stdout == f"haptic-loop {version('haptic-loop')}\n"
+    assert script("--version").stdout == f"haptic-loop {version('haptic-loop')}\n"

@@ -248,9 +248,7 @@ IN_EXEC = "exec('raise KeyboardInterrupt')\n"  # dataclass runs code in this way
 IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise ImportError('failed') from error\n"
 
 
-@pytest.mark.parametrize(
-    "command", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run", "cli run"]
-)
+@pytest.mark.parametrize("command", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run"])
 def test_ctrl_c_during_command_imports_exits_with_130(command, tmp_path):
     assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
 
