@@ -45,7 +45,7 @@ def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
 
 
 def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
-    """Raise TypeError for an option that is not allowed; `what` names the owner of the options in the message."""
+    """Raise TypeError for an option that is not allowed. `what` names the function or kind that has the options."""
     for option in options:
         if option not in allowed:
             close = difflib.get_close_matches(option, allowed, n=1)
@@ -55,7 +55,7 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """Describe `value` for a message: `2.5 (float)`, or `a Loop` for a long repr or a class of this package."""
+    """Return a description of `value` for a message: `2.5 (float)`, or `a Loop` for long text or our own classes."""
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

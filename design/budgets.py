@@ -1,4 +1,4 @@
-"""Budgets of the searches, in one table, each with the measurement that set it.
+"""Budgets of the searches, each with the measurement that set it, and checks of the size of a proof and of a sweep.
 
 A search ends because it has converged, because a proof or a bound decides, or because one of these budgets is spent.
 No clock ends it unless the user sets a time limit, so that results do not depend on the load of the machine. Work is
@@ -20,7 +20,7 @@ from haptic_loop.controller.lti import Lti
 EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.003 for two or three devices and 0.007 for eight.
 SWEEPS = 60.0
-#: The search over larger bases of an optimal coupling. The slowest of the 23 loops takes 19 (o11).
+#: The search for larger bases of an optimal coupling. The slowest of the 23 loops (o11) takes 19.
 GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: about 500 sweeps for each set of present springs.
 RANGES = 60.0
@@ -29,61 +29,65 @@ RANGES = 60.0
 
 #: Largest number of states of a loop with a basis. Design and proof of a loop with 268 states take 8 units (n6).
 BASIS_STATES = 270
-#: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
+#: Largest cost of the proofs of a basis, (number of environments) states^2.7. It is that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
 #: Largest number of unknowns of a basis with filters between all channels, for this-environment alone (ten seconds).
 BASIS_UNKNOWNS = 1600
 #: In all other cases, the largest product of the numbers of unknowns and channels (also ten seconds).
 BASIS_BESIDE = 3500
-#: Number of successive bases without a certified coupling after which no larger basis is tried; ranges have no limit.
+#: Number of successive bases without a certified coupling after which no larger basis is tried. Loops with ranges have
+#: no such limit.
 UNPROVED_BASES = 2
-#: Largest number of bases, the best first, whose couplings are tried at every vertex of ranges until one is proved.
+#: Largest number of bases whose couplings are tried at every vertex of ranges. The best basis is tried first, and the
+#: first proved coupling ends the trials.
 RANGED_BASES = 3
 
-# Sizes of proofs, and rounds of searches that normally converge earlier, with the measured numbers -------------------
+# Sizes of proofs, and rounds of searches. Normally a search converges earlier, in the number of rounds in brackets ----
 
 #: Largest number of states of a proved block. A proof takes 0.3 s at 100, 1 s at 200, 5 s at 400 and 30 s at 800.
 PROOF_STATES = 800
-#: Rounds of cutting planes for a multiplier (sim/scenarios/one-wall.toml takes 8), and rounds without progress after
-#: which they end.
+#: Rounds of cutting planes for a multiplier (8 for sim/scenarios/one-wall.toml), and number of rounds without progress
+#: that end them.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have 24 rows.
 MULTIPLIER_ROWS = 24
-#: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many channels
-#: the search takes the first number from every start, and the second from the best starts. With few channels it takes
-#: the third from every start.
+#: Rounds of a search for gains, each with more frequencies (3 for case I), and numbers of steps in a round. With many
+#: channels a round takes the first number of steps from every start, and the second from the best starts. With few
+#: channels it takes the third number from every start.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
-#: Rounds that add frequencies to a design by Theorem 4. Only delays of a hundred samples and more need them.
+#: Rounds that add frequencies to a design by Theorem 4. Only delays of at least a hundred samples need such rounds.
 THEOREM_4_ROUNDS = 12
-#: Steps of the sequence of convex problems for gains. Case I takes 2.
+#: Steps of the sequence of convex problems for gains (2 for case I).
 SEQUENCE_STEPS = 60
-#: Designs for less and less damping, until the coupling satisfies a second condition. one-wall.toml takes 2.
+#: Designs for less and less damping, until the coupling satisfies a second condition (2 for one-wall.toml).
 LESS_DAMPING_ROUNDS = 6
-#: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
+#: Rounds that add frequencies to the program of an optimal coupling (4 for case I).
 PROGRAM_SWEEPS = 6
 #: Rounds that add frequencies to the bound on linear couplings, number of its vanishing sums of coefficients s_k
-#: (docs/theory.md), and intervals of its integral. Cases I and II take 2 rounds and 568 intervals.
+#: (docs/theory.md), and intervals of its integral (2 rounds and 568 intervals for cases I and II).
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
-#: Convex problems for a coupling of fixed order. Case I takes 44.
+#: Convex problems for a coupling of fixed order (44 for case I).
 FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
-#: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.
+#: and multipliers (4 cuts and 11 rounds for the pair of omega.3 with known transmissions).
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, but on each edge at
-#: least RANGE_ALONG[0] (from six parameters on, more than RANGE_EDGES in total) and at most RANGE_ALONG[1]; RANGE_DRAWN
-#: on faces and inside. RANGE_STARTS compass searches follow. Up to five parameters this takes the 500 sweeps of RANGES.
+#: Numbers of points that a search between the vertices of ranges tries. RANGE_EDGES is that for all edges together, and
+#: RANGE_ALONG has the least and the largest number for one edge. From six parameters on, the least number for each edge
+#: gives more than RANGE_EDGES in total. RANGE_DRAWN points lie on faces and inside. RANGE_STARTS compass searches
+#: follow. For up to five parameters this takes the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
-# Steps of iterations that converge. Brackets hold the largest number in the optimal and the default designs of cases I
-# and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) ----------------------------------------------
+# Steps of iterations that converge. Brackets hold the largest number that was measured in the optimal and the default
+# designs of cases I and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) ---------------------------
 
-#: Steps to a point of a barrier's path (7), and of the primal-dual method (two runs took all 60 because of rounding).
+#: Steps to a point of a barrier's path (7), and steps of the primal-dual method (60 in two runs because of rounding).
 CENTRING_STEPS, CONE_STEPS = 60, 60
-#: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further pass
-#: divides the condition number by as much. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after
-#: them (1).
+#: Passes of the exact test of definiteness (2). One pass is enough for a condition number below 1e14, and each further
+#: pass divides the condition number by 1e14. Doublings of a Riccati or Lyapunov equation (21), and Newton steps that
+#: follow them (1).
 DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
-#: Blocks of 256 ticks of an impulse response that are summed. Only a time constant above 250,000 ticks needs them all.
+#: Blocks of 256 ticks of an impulse response that are summed. Only a time constant above 250,000 ticks needs all
+#: blocks.
 GAIN_CHUNKS = 20_000
 
 

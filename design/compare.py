@@ -1,4 +1,4 @@
-"""Evaluate couplings over frequency: singular values, required damping, perceived stiffness and damping."""
+"""Evaluate couplings over frequency: singular values, required damping, and perceived stiffness and damping."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Demands:
 
     F: Lti
     requirements: dict[str, Requirement]
-    demands: dict[str, Response | None]  # by condition: w -> required over available damping, or None for no curve
+    demands: dict[str, Response | None]  # condition -> function of w: required over available damping; None: no curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +56,11 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Evaluate F with all walls touching, each condition's requirement, and the required damping over frequency.
+    """Return F with all walls touching, and the requirement and the required damping over frequency of each condition.
 
-    The conditions are this-environment, or switching for delays that switch, any-environment and a user's `own`;
-    `known` are requirements from an assessment of this loop and coupling. Raises SingularLoop if the algebraic loop has
-    no solution.
+    The conditions are this-environment (for delays that switch: switching), any-environment and a user's `own`. `known`
+    holds requirements from an assessment of this loop and coupling. Raises SingularLoop if the algebraic loop has no
+    solution.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment)
@@ -74,7 +74,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands]) -> Array:
-    """Return frequencies [Hz] up to 1/(2 T), dense around poles, with FEEL_HZ and the binding frequencies."""
+    """Return frequencies [Hz] up to 1/(2 T), dense around poles, and with FEEL_HZ and the binding frequencies."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=_LOWEST_HZ * per_hz, high=np.pi, points=200) / per_hz
@@ -105,6 +105,6 @@ def _singular_values(G: NDArray[np.complex128]) -> Array:
 
 
 def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
-    """Return the diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
+    """Return the diagonal entries of responses from displacements to forces (k, m, m) as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])

@@ -1,8 +1,8 @@
-"""The matrix D of the dual problem in design.bound, with a lower bound of its eigenvalues on the whole circle.
+"""The matrix D of the dual problem in design.bound, with a lower bound of its eigenvalues on the whole circle |z| = 1.
 
-D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0, with the H and C_k of design.bound, is scaled by
-root(delta) from both sides. H is piecewise linear; at each bend x_i its slope changes by 2 pi c_i. H_0 is the mean of
-H over the circle (`mean`). With a = 1/z - 1 this gives
+D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 at z = exp(jw), with the H and C_k of design.bound, is
+scaled by root(delta) from both sides. H is piecewise linear; at each bend x_i its slope changes by 2 pi c_i. H_0 is the
+mean of H over the circle (`mean`), and H_+ is the causal part of H. With a = 1/z - 1 and the dilogarithm Li2 this gives
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
@@ -10,15 +10,15 @@ In an interval of length l without a bend inside, the error of linear interpolat
 - l^2/8 max |f^(2)| for any f, with the second derivative f^(2);
 - l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi. Proof:
   Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2 with |cot(x/2)|/2 <= 1/|x|. The bound 1/|x| is the second derivative of
-  x log x, whose interpolation error is largest on [0, l], where it is l/e;
-- l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with derivatives in the middle, for the sum over far bends, whose
-  terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
+  x log x. The interpolation error of x log x is largest on [0, l], where it is l/e;
+- l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with the derivatives |f^(2)| and |f^(3)| in the middle. This bound
+  serves the sum over far bends, whose terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
 - |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for the product a g. The last two terms are the error of
   a times the interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times
   its slope, with |a^(1)| = |a^(2)| = 1.
-On the line between two Hermitian matrices, no matrix has an eigenvalue below the smaller of their least eigenvalues.
-The least eigenvalue of D in the interval is therefore at least the smaller of those at its ends, less the Frobenius
-norm of the errors above and of rounding.
+A matrix on the line between two Hermitian matrices has no eigenvalue below the smaller of their least eigenvalues. So
+take the smaller of the least eigenvalues of D at the ends of the interval, and subtract the Frobenius norm of the
+errors above and of rounding. The result is a lower bound of the eigenvalues of D in the interval.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.frequency import hermitian
 
 _UNIT = 2.0**-53  # unit roundoff of double precision
-_EVALUATION = 6e-8  # units of counted work for one bend at one frequency
+_EVALUATION = 6e-8  # counted work of one bend at one frequency, in units of design.budgets
 _MOST = 40_000_000  # largest number of bends times frequencies for one matrix, which takes about two seconds
 _CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache
 _FAR = 2.0  # distance beyond which a bend counts as far, in lengths of the interval
@@ -67,10 +67,10 @@ class DualMatrix:
         return cls(points, np.diff(slope, axis=0), np.abs(slope[1:]) + np.abs(slope[:-1]), mean, sums)
 
     def lower(self, swept: Array, wanted: float) -> tuple[float, Array, Array]:
-        """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
+        """Return a lower bound of D's eigenvalues, evaluated frequencies (k,), and the least eigenvalues there (k,).
 
-        The intervals between the frequencies `swept` and the bends are halved until each has a bound above -`wanted`,
-        or an error that is small compared with the eigenvalues at its ends. The search also ends after _MOST
+        The frequencies `swept` and the bends are the ends of intervals. An interval is halved until its bound is above
+        -`wanted`, or its error is small compared with the eigenvalues at its ends. The search also ends after _MOST
         evaluations of bends.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
@@ -102,12 +102,12 @@ class DualMatrix:
         return float(bound) - self.rounding(), np.concatenate(where)[order], np.concatenate(values)[order]
 
     def rounding(self) -> float:
-        """Return a bound of the error of D's eigenvalues by rounding, at any frequency.
+        """Return a bound of the rounding error of D's eigenvalues at any frequency.
 
-        In units of u = 2^-53 the error of a complex sum of n products is 3 (n + 6) times the sum of absolute values,
-        with |Li2| <= 2. The errors of single numbers are: 300 for Li2, of which 160 come from the rounding of its
-        argument near 2 pi; 8 times the adjacent slopes for a bend; 2 for a, with |a| <= 2; 7 (k + 2) for a power z^-k;
-        20 m times the norm for an eigenvalue.
+        In units of 2^-53, the error of a complex sum of n products is 3 (n + 6) times the sum of absolute values, with
+        |Li2| <= 2. A value of Li2 has an error of 300, of which 160 come from the rounding of its argument near 2 pi.
+        The error of a bend is 8 times the adjacent slopes, that of a is 2, with |a| <= 2, and that of a power z^-k is 7
+        (k + 2). The error of an eigenvalue is 20 m times the norm.
         """
         m, bends, slopes = len(self.mean), np.abs(self.bends).sum(axis=0), self.slopes.sum(axis=0)
         steps = np.arange(len(self.sums))[:, None, None]
@@ -142,7 +142,7 @@ class DualMatrix:
         squares = np.arange(len(self.sums))[:, None, None] ** 2
         error = error + length**2 / 8 * (squares * np.abs(self.sums)).sum(axis=0)
         norm = np.linalg.norm((error + np.swapaxes(error, 1, 2)) / 2, axis=(1, 2))
-        return (1 + 1e-9) * norm  # The sums have no negative terms, so their relative rounding is far below 1e-9.
+        return (1 + 1e-9) * norm  # The sums have no negative terms, so their relative rounding error is below 1e-9.
 
     def _interpolation(self, left: Array, right: Array) -> Array:
         """Return bounds (k, m^2) on the interpolation errors of the entries of g; left and right are (k, 1)."""

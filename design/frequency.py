@@ -11,20 +11,18 @@ from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Lti
 
 _ERROR = 1e-6  # allowed relative error of an integral
-_HALVINGS, _HALVED = (
-    20,
-    1000,
-)  # most rounds of halving (3 in the designs of cases I and II), and intervals halved in one
-_ROUNDING = 1e-20  # Smaller means count as 0: rounding causes them in squared differences of nearly equal responses.
+_HALVINGS = 20  # largest number of rounds of halving; the designs of cases I and II take 3
+_HALVED = 1000  # largest number of intervals that are halved in one round
+_ROUNDING = 1e-20  # A smaller mean counts as 0: rounding of squared differences of nearly equal responses causes it.
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
 def integral(response: Callable[[Array], Array], grid: Array) -> float:
     """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
-    Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval that is the
-    share s of the range is halved if the two results differ by more than s _ERROR times the integral, unless the mean
-    of their difference is below _ROUNDING. If too many intervals qualify, only the worst are halved.
+    Gauss's rule with three points is applied to each interval of the grid and to its halves. Let an interval be the
+    share s of the range. It is halved if the two results differ by more than s _ERROR times the integral, unless the
+    mean of their difference is below _ROUNDING. If too many intervals qualify, only the worst are halved.
     """
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
@@ -64,9 +62,10 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 
 
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
-    """Return the suprema (n,) of n functions; the grid is `common` (k,) and each function's `own` (n, p) frequencies.
+    """Return the suprema (n,) of n functions of frequency.
 
-    The highest peaks are refined between the frequencies. A function with a value that is not finite gives inf.
+    The grid of a function consists of the frequencies `common` (k,) and of its row of `own` (n, p) [rad/sample]. The
+    highest peaks are refined between grid points. A function with a value that is not finite gives inf.
     """
     n = own.shape[0]
     parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
@@ -94,14 +93,15 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
 
 
 def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
-    """Return the frequencies (n, peaks) of the grid next below and above `at`; a grid may contain a frequency twice."""
+    """Return the grid's frequencies (n, peaks) next below and next above `at`. A grid may contain a frequency twice."""
     room = 1e-12 * grid[:, -1:]
     below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
     above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
     return below, above
 
 
-#: [rad/sample] _LOWEST stands for 0 (error 1e-8, because responses are even in w). _BELOW resolves slow poles.
+#: [rad/sample] _LOWEST stands for 0; the error is about 1e-8, because responses are even in w. _BELOW resolves slow
+#: poles.
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
 _EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced frequencies
 _PER_LOBE = 24  # evenly spaced frequencies for each lobe that a delay causes in the response
@@ -127,10 +127,10 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 
 
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
-    """Return sorted frequencies [rad/sample] in [low, high]: evenly spaced in w and in log w, dense around poles.
+    """Return sorted frequencies [rad/sample] in [low, high]: evenly spaced in w and in log w, and dense around poles.
 
-    A pole r exp(j phi) bends the response over a width of about 1 - r around phi. A repeated pole counts once, because
-    two points that differ by rounding only would make the bracket of a peak there too narrow.
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi. A repeated pole counts once.
+    Otherwise two points that differ by rounding only would make the bracket of a peak too narrow.
     """
     poles = _distinct(np.concatenate([g.poles() for g in systems])) if systems else np.zeros(0)
     width = np.maximum(1 - np.abs(poles), 1e-9)
@@ -147,11 +147,11 @@ _OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # distances of frequencies fro
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
     """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
-    A tick in double precision is an exact tick of a system whose coefficients have relative errors of at most
-    (2n + 8) 2^-53, for n states and up to n + 8 inputs. The differences between G and a system `meant` with the same
-    states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
-    |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. The difference between the two responses would not do instead: it is
-    large as soon as a sharp peak moves by its own width.
+    A tick in double precision is an exact tick of a system whose coefficients have relative errors of at most (2n + 8)
+    2^-53, for n states and up to n + 8 inputs. If G approximates a system `meant` with the same states, the differences
+    of their coefficients are added to these errors. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response
+    by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. The difference of the two responses is no substitute for
+    this bound, because it is large as soon as a sharp peak moves by its own width.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -165,7 +165,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return poles with imag >= 0, without those nearer to an earlier pole than 1 % of their distance to the circle."""
+    """Return poles with imag >= 0, without a pole that is near an earlier one (1 % of its distance to the circle)."""
     distinct = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
         if not (np.abs(distinct - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
@@ -205,10 +205,10 @@ _GAIN = 1e-13  # relative gain of a peak that a search neglects
 
 
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
-    """Return frequencies (peaks,) of local maxima of `response` above `above`, 32 at most, refined between grid points.
+    """Return frequencies (peaks,) of at most 32 local maxima of `response` above `above`, refined between grid points.
 
-    Maxima that are lower than the highest by more than the share `near` are left out. The last ones stand out most: on
-    the grid they have the largest `_reach`.
+    A maximum that is lower than the highest one by more than the share `near` is left out. The maxima are sorted by
+    their `_reach` on the grid, so that the last one stands out most.
     """
     spend(_POINT * grid.size)
     values = response(grid)
@@ -222,9 +222,9 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 def _brackets(values: Array, grid: Array, above: float) -> Array:
     """Return brackets of local maxima of at least `above`, at most 32, chosen by `_reach`.
 
-    They are not chosen by value, because rounding of a flat response makes many maxima, which may be higher than the
-    grid points of a true peak. A bracket has three points. Axis 0 is (frequency, value), axis 1 (left, peak, right),
-    and axis 2 the bracket.
+    They are not chosen by value, because rounding gives a flat response many maxima. Such a maximum may be higher than
+    the grid points of a true peak. A bracket has three points. Axis 0 is (frequency, value), axis 1 is
+    (left, peak, right), and axis 2 is the bracket.
     """
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
@@ -234,14 +234,15 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
     return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
-#: Distances of trial points from the parabola's peak, in widths of the bracket: they find a smooth peak, whose distance
-#: from the parabola's peak falls with the square of the width. Trial points at eighths of the bracket find a kink.
+#: Distances of trial points from the parabola's peak, in widths of the bracket. Near a smooth peak the distance of the
+#: true peak from the parabola's peak falls with the square of the width. Trial points at eighths of the bracket find a
+#: kink.
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
 _EIGHTHS = np.arange(1, 8)[:, None] / 8
 
 
 def _narrowed(response: Response, bracket: Array) -> Array:
-    """Return new brackets: the best of each bracket's three points and of 16 trial points, with its two neighbours."""
+    """Return new brackets. Each is the best of three old and 16 trial points, with the two points beside it."""
     (left, middle, right), (low, high, last) = bracket
     width = right - left
     with np.errstate(divide="ignore", invalid="ignore"):  # Equal points or values give the middle.
@@ -296,9 +297,9 @@ def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
 def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
     """Return the least eigenvalues (k,) of Hermitian matrices (k, m, m) and their unit eigenvectors (k, m).
 
-    For many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. Its shift differs from the
-    eigenvalue by 1e-13 of the largest entry, so that the share of every other eigenvector is multiplied by at most this
-    difference over the distance of both eigenvalues.
+    For many rows one step of inverse iteration is 1.4 times as fast as the computation of all eigenvectors. Its shift
+    differs from the eigenvalue by 1e-13 of the largest entry. The step multiplies the share of any other eigenvector by
+    at most this difference over the distance of the two eigenvalues.
     """
     m = H.shape[-1]
     if m == 2:
@@ -314,9 +315,9 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
 
 
 def _least_of_two(a: Array, d: Array, b: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
-    """Return the least eigenvalues (k,) of [[a, b], [b*, d]], (k,) each, and their unit eigenvectors (k, 2).
+    """Return the least eigenvalues (k,) of [[a, b], [b*, d]], with a, b and d (k,), and unit eigenvectors (k, 2).
 
-    Of the two rows of (H - lambda I) v = 0, the row with the larger diagonal entry is solved, which cancels no digits.
+    Each eigenvector solves the row of (H - lambda I) v = 0 with the larger diagonal entry, which cancels no digits.
     """
     half = (a - d) / 2
     radius = np.hypot(half, np.abs(b))

@@ -1,9 +1,8 @@
 """The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
-`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
-arrays or cvxpy expressions.
-
-The strict inequalities (2), (15), (17) and (18) of the paper have no solution; docs/theory.md has the remedies.
+`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite. Their arguments are
+arrays or cvxpy expressions. The strict inequalities (2), (15), (17) and (18) of the paper have no solution;
+docs/theory.md says how the program avoids them.
 """
 
 from __future__ import annotations
@@ -45,9 +44,9 @@ def _low_pass(channels: int, T: float) -> Lti:
 
 
 class Shaping:
-    """The weighted L (22) of a loop, L W2, for fast evaluation with many couplings.
+    """The weighted function L W2 of a loop, with L (22) and W2 = `_low_pass`, for fast evaluation with many couplings.
 
-    W2 is `_low_pass`. Raises ValueError for an active environment.
+    Raises ValueError for an active environment.
     """
 
     def __init__(self, loop: Loop) -> None:
@@ -60,7 +59,7 @@ class Shaping:
         self.environment = delay(loop.psi, T) @ E  # Psi E
 
     def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
-        """Return Psi E, W2 and I - Psi Lambda^-1 Theta at exp(jw), each (k, m, m)."""
+        """Return Psi E, W2 and I - Psi Lambda^-1 Theta at z = exp(jw) for w (k,) [rad/sample], (k, m, m) each."""
         z = on_circle(w)
         return self.environment.at(z), self.W2.at(z), self.late.at(z)
 
@@ -69,7 +68,7 @@ class Shaping:
         return np.concatenate([[0.0], frequencies(self.environment, self.W2, *systems)])
 
     def gain(self, V: Lti, w: Array) -> Array:
-        """Return sigma_max of L W2 at exp(jw), shape (k,)."""
+        """Return sigma_max of L W2, (k,), at w (k,) [rad/sample]."""
         environment, weight, late = self.parts(w)
         return np.linalg.norm((environment @ V.at(on_circle(w)) + late) @ weight, 2, axis=(1, 2))
 
@@ -104,7 +103,7 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
 
 
 def reachability_scaled(G: Lti) -> Array:
-    """Return S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
+    """Return S (n, n) such that the states S^-1 x of G have the identity as their regularised reachability Gramian."""
     import scipy
 
     A, W = G.A, G.B @ G.B.T
@@ -112,7 +111,7 @@ def reachability_scaled(G: Lti) -> Array:
         warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
         try:
             W = scipy.linalg.solve_discrete_lyapunov(A, W)
-        except scipy.linalg.LinAlgWarning:  # ill-conditioned: sum A^k B B' A'^k; each step doubles the terms
+        except scipy.linalg.LinAlgWarning:  # ill-conditioned: each step doubles the summed terms of the series
             while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
@@ -123,7 +122,7 @@ _Matrix = Any  # Array or cvxpy expression, (rows, columns)
 
 
 class Ports(NamedTuple):
-    """x+ = A x + B u with the port output y2 = C2 x + D2 u and the output y1 = C1 x + D1 u, whose square is dissipated.
+    """The system x+ = A x + B u with two outputs, y2 = C2 x + D2 u at the port and y1 = C1 x + D1 u.
 
     The supply is y2'u - y1' Delta y1 - u' Phi u. Output strict passivity has y1 = y2.
     """
@@ -141,7 +140,7 @@ class Ports(NamedTuple):
 
 
 def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
-    """Return the matrix of x'Px - x+'Px+ + supply in (x, u), the negative of (2); this matrix and P must be > 0."""
+    """Return the matrix of x'Px - x+'Px+ + supply in (x, u), the negative of (2). This matrix and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
     state = P - A.T @ P @ A - C1.T @ Delta @ C1
@@ -150,7 +149,7 @@ def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
 
 
 def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
-    """Return [[Y, R'], [R, S]] of Lemma 2, which is affine in A, B, C, D, so that these may be unknowns.
+    """Return [[Y, R'], [R, S]] of Lemma 2. It is affine in A, B, C and D, so that these may be unknowns.
 
     With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is equivalent to (2). Sigma = None means Delta = 0.
     """
@@ -169,7 +168,10 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
 
 
 def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
-    """Return the matrix of Lemma 3 and (24), mu2 = mu^2; > 0 for some U > 0 and X = U^-1 iff ||G||_inf < mu."""
+    """Return the matrix of Lemma 3 and (24) with mu2 = mu^2.
+
+    It is positive definite for some U > 0 and X = U^-1 if and only if ||G||_inf < mu.
+    """
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
         [X, np.zeros((n, m)), A.T, C.T],
@@ -181,7 +183,7 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
-    """Return the block matrix without empty blocks, exactly symmetric; an array if every block is an array."""
+    """Return the block matrix of all blocks that are not empty, made exactly symmetric. Arrays give an array."""
     blocks = [[block for block in row if 0 not in block.shape] for row in rows]
     blocks = [row for row in blocks if row]
     numbers = all(isinstance(block, np.ndarray) for row in blocks for block in row)

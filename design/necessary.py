@@ -1,11 +1,12 @@
-"""The necessary damping of devices with known motor and transmission (Theorem A), by a sweep, for design.audit.
+"""Compute the necessary damping of devices with known motor and transmission (Theorem A), by a sweep, for design.audit.
 
 A motor with linear dynamics (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper
-b in parallel. The loop is stable for every passive hand under two conditions: it is stable with the far end of the
-transmission held, and no sampled response of motor and hand to a held force makes it singular. For all passive hands
-these responses fill a disk. With one channel, or channels with equal devices, every point of its circle belongs to a
-lossless hand. The sweep uses the device of least mass, least damping, stiffest spring and least damper within the
-bounds. docs/theory.md has the proof; compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009).
+b in parallel. The loop is stable for every passive hand under two conditions. First, it is stable if the hand's end of
+the transmission is held. Second, no sampled response of motor and hand to a held force makes the loop singular. At each
+frequency, the responses with all passive hands fill a disk. With one channel, or channels with equal devices, every
+point of the disk's circle belongs to a lossless hand. The sweep uses the least mass, the least damping, the stiffest
+spring and the least damper within the bounds. docs/theory.md has the proof; compare Fardad and Bamieh, IEEE
+Transactions on Automatic Control 54 (2009).
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from haptic_loop.design.result import Requirement, listed
 def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
     """Return sig0 and sig2 (n,) [m/(N s)] at w (n,) [rad/sample] for motors of `damping` (n,) [N s/m].
 
-    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n). Here
-    a_n = delta + j m w_n, g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. The terms are rational in w_n.
-    With W = w_n^2 their denominator is d = b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2 in S2, and W d in S0. The
-    sums of their partial fractions are cotangents.
+    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n), summed over the
+    aliases w_n = (w + 2 pi n)/T. Here a_n = delta + j m w_n, g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n
+    |a_n|^2. The terms are rational in w_n. With W = w_n^2 the denominator of the terms of S2 is d = b m^2 W^2 + (delta
+    b^2 + b delta^2) W + delta k^2, and that of the terms of S0 is W d. The sums of their partial fractions are
+    cotangents.
     """
     high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
     root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))
@@ -57,18 +59,18 @@ class _Necessary(NamedTuple):
 
     share: float
     w: float  # binding frequency [rad/sample]
-    held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
+    held: bool  # whether the loop is stable at this share if the hands' ends of the transmissions are held
 
 
-_LOWEST = 1e-4  # [rad/sample] lowest frequency; at z = 1 the disk touches the point that it must not contain
+_LOWEST = 1e-4  # [rad/sample] lowest frequency; at frequency 0 the disk touches the point that it must not contain
 _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the damping
 
 
 def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand makes the loop unstable, by a refined sweep.
 
-    The motors' dynamics are assumed to be linear. For one channel or equal devices no condition on these devices
-    requires less than this share. Otherwise the share is sufficient, and close to the least share.
+    The motors' dynamics are assumed to be linear. For one channel or equal devices no condition for these devices
+    requires less than this share. For other devices the share is sufficient, and close to the least sufficient share.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels
@@ -106,11 +108,12 @@ class LeftOver:
     """The damping at which Theorem A holds, and the damping that known-device requires.
 
     Attributes:
-        required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less, and
-            no proof can improve on `known_device_damping` by more than the difference. Otherwise less may be enough.
+        required_damping: (m,) [N s/m] at which Theorem A holds, by a sweep. If `attained`, no condition for these
+            devices requires less, so that no proof can improve on `known_device_damping` by more than the difference.
+            If not `attained`, less damping may be enough.
         frequency_hz: The binding frequency.
-        attained: Whether a lossless hand destabilises the loop at every smaller damping. This holds for
-            one channel, and for channels with equal devices.
+        attained: Whether some lossless hand destabilises the loop at any smaller damping. This holds for one channel,
+            and for channels with equal devices.
         known_device_damping: (m,) [N s/m] that known-device requires, by a sweep; None if it is infinite.
     """
 
@@ -132,7 +135,7 @@ class LeftOver:
 
 
 def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
-    """Return the damping at which Theorem A holds; None if it does not apply to this loop, or holds at no damping.
+    """Return the damping at which Theorem A holds, or None if the theorem does not apply or holds at no damping.
 
     `proved` is the requirement of known-device, if the caller has it.
     """
@@ -140,7 +143,8 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
         return None
     equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
     if walls and not equal:
-        # With walls the share is only necessary, with unequal devices only sufficient; with both it is neither.
+        # With walls the share is necessary but not sufficient. With unequal devices it is sufficient but not necessary.
+        # With both it is neither.
         return None
     try:
         maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]
@@ -158,7 +162,7 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
 
 def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:
-    """Return whether the loop is stable at `share` of the damping with the far end of every transmission held."""
+    """Return whether the loop is stable at `share` of the damping if the hand's end of every transmission is held."""
     import scipy
 
     m, known = loop.channels, loop.known_devices or ()

@@ -51,7 +51,7 @@ _LOADED: dict[Path, ModuleType] = {}
 
 
 def _loaded(option: str, text: str, file: Path) -> ModuleType:
-    """Import the file once, as a module with the file's name, so that worker processes find its classes."""
+    """Return the module of the file. It is imported once, under the file's name, so that workers find its classes."""
     forked.allowed = False
     if file in _LOADED:
         return _LOADED[file]
@@ -80,10 +80,10 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
 
 
 def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:
-    """Call a user's own class or function.
+    """Call a user's own class or function, and return its result.
 
-    An InputError, and an error whose traceback has a line of the user's code, pass unchanged. Any other error, such as
-    that of wrong arguments, becomes an InputError that begins with `what`, and so does sys.exit().
+    An InputError passes unchanged, and so does an error whose traceback has a line of the user's code. Any other error,
+    such as that of wrong arguments, becomes an InputError that begins with `what`. So does sys.exit().
     """
     try:
         return make(*args, **options)

@@ -18,11 +18,11 @@ from haptic_loop.design.frequency import frequencies, integral, on_circle, supre
 
 BAND_HZ = (0.5, 80.0)  # [Hz] default band of the mismatch
 _LATEST = 0.45  # [1/T] A band that begins above this is too narrow for the grids of sweeps and of design.bound.
-_ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
+_ROUNDING = 1e-10  # F and Lambda E count as equal if they differ by less than this share of the environment E.
 
 
 def in_band(band_hz: Sequence[float], T: float) -> tuple[float, float]:
-    """Return the ends of a band [Hz] in rad/sample, at most pi. Raises TypeError or InputError for anything else."""
+    """Return the ends of a band [Hz] in rad/sample, at most pi. Raises TypeError or InputError for another value."""
     expected = f"two rising frequencies in Hz, the first above 0 and below {_LATEST / T:.6g}"
     of_kind("band_hz", band_hz, Sequence, expected)
     band = [2 * np.pi * T * number("band_hz", frequency, expected) for frequency in band_hz]
@@ -102,7 +102,7 @@ def _reference(environment: Lti, lam: Sequence[int], band_hz: tuple[float, float
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """Compute the figures of the force map F against Lambda E. Raises ValueError if E is zero."""
+    """Return the figures of the force map F against Lambda E. Raises ValueError if E is zero."""
     target, low, high = _reference(environment, lam, band_hz)
 
     def mismatch(w: Array) -> NDArray[np.complex128]:
@@ -110,7 +110,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         return F.at(z) - target.at(z)
 
     def sizes(w: Array) -> tuple[Array, Array, Array]:
-        """Return sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; the values at the grid are cached."""
+        """Return sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each. The values at the grid are stored."""
         if w is grid and known:
             return known[0]
         E = np.linalg.svd(environment.at(on_circle(w)), compute_uv=False)
@@ -157,7 +157,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
-    """Compute the rms mismatch over log frequency; equal maps give about 0. Raises ValueError if E is 0."""
+    """Return the rms mismatch over log frequency, a ratio; equal maps give about 0. Raises ValueError if E is zero."""
     target, low, high = _reference(environment, lam, band_hz)
 
     def square(logarithm: Array) -> Array:
