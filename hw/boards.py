@@ -3,7 +3,7 @@
 In a step, the host takes one sample of every board and computes one force for each. Steps are numbered by the ticks of
 the leading board. Each other board contributes its next sample, or repeats its last sample where its clock has fallen
 behind by a period. A repeated sample is a tick of length zero, in which no force exchanges energy. So every board sees
-forces that are a whole number of steps old, and ticks that are no longer than its own period. A certificate for T_max
+forces that are a whole number of steps old, and ticks of at most its own period. A certificate for T_max
 covers these delays and ticks.
 """
 
@@ -22,8 +22,8 @@ from haptic_loop.hw.monitor import CommandMonitor
 
 _CLEARLY_FASTER = 1e-4  # relative difference of two clocks that stands out from jitter after _COMPARED ticks
 # The lead of a sample is the time by which it comes before the leading board's sample of the same step.
-_EARLY = 1 / 16  # [periods] least lead; with less, steps may have to wait for the sample
-_TOO_EARLY = 1.5  # [periods] largest lead; with more, the board's force may come too late
+_EARLY = 1 / 16  # [periods] least lead; with a smaller lead, steps may have to wait for the sample
+_TOO_EARLY = 1.5  # [periods] largest lead; with a larger lead, the board's force may come too late
 _SMOOTHED = 31  # number of leads whose median is used; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
@@ -56,7 +56,8 @@ class _Board:
         self.last: wire.State | None = None  # newest STATE that came after the last CONFIG; None before
         self.misses = 0  # State.misses in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
-        self._steps = self._shifted = 0  # steps since the first pairing; their number when `offset` was last lowered
+        self._steps = 0  # steps since the first pairing
+        self._shifted = 0  # value of `_steps` when `offset` was last lowered
 
     def configure(self, config: wire.Config) -> None:
         """Forget all samples and store the board's part of a configuration."""
@@ -300,7 +301,7 @@ class Boards:
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
         """Return one STATE with the worst phase and margin, the sum of errors, and the axes of all boards in order.
 
-        In each step the misses grow by those of the board that missed most. The phases come from the last STATE of
+        In each step the misses grow by the misses of the board that missed most. The phases come from the last STATE of
         every board, not from the samples of the step, so a fault shows at once.
         """
         last = [board.last for board in self._boards if board.last]
@@ -323,7 +324,7 @@ class Boards:
         )
 
     def _margin(self, samples: Sequence[wire.State]) -> int:
-        """Return the least margin of the boards' answers, or NO_MARGIN if a board reports none.
+        """Return the least margin of the boards' answers [us], or NO_MARGIN if a board reports no margin.
 
         Until forces act, the margin excludes the wait for other boards.
         """

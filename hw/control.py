@@ -94,7 +94,7 @@ def host_controller(
 def _fill(previous: tuple[float, ...], x: tuple[float, ...], ticks: int) -> list[tuple[float, ...]]:
     """Interpolate linearly from `previous` to x (m,) [m] over `ticks` ticks, of which only the last was received.
 
-    A step instead would make a damper B answer with a force of B dx/T.
+    Without interpolation, a damper B would answer a displacement dx with a force of B dx/T.
     """
     line = [tuple(a + (b - a) * (i / ticks) for a, b in zip(previous, x, strict=True)) for i in range(1, ticks)]
     return [*line, x]
@@ -106,7 +106,7 @@ class BudgetPlan:
 
     start: float  # W0 [J]
     cap: float | None  # [J] largest budget, None for no limit
-    delta: tuple[float, ...]  # (m,) [N s/m]
+    delta: tuple[float, ...]  # (m,) [N s/m] guaranteed damping
     encoder_step: tuple[float, ...]  # (m,) [m]
     force_step: tuple[float, ...]  # (m,) [N]
     theta: int  # [ticks]
@@ -118,8 +118,8 @@ class BudgetPlan:
         """Return the plan for a device of this configuration.
 
         The device holds a force for `hold` missed ticks, then ramps it to zero. Because of its slew rate, an older
-        force still acts in up to ceil(config.cap / config.slew) later ticks with an answer, each after up to
-        `hold` missed ticks. Afterwards, the applied force lies between forces that were sent later.
+        force still acts in up to ceil(config.cap / config.slew) later ticks with an answer. Up to `hold` missed ticks
+        precede each of these ticks. Afterwards, the applied force lies between forces that were sent later.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -142,8 +142,8 @@ class SentBudget:
     def limit(self, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int) -> tuple[int, ...]:
         """Return the steps to send in place of `steps` at x (m,) [m]; f = `applied` (m,) [N] acts from this tick on.
 
-        In the `missed` ticks before this one nothing was received or sent. Their motion is unknown, so each of them
-        is booked with the largest energy that it may have cost.
+        In the `missed` ticks before this one nothing was received or sent. Their motion is unknown, so each of these
+        ticks is booked with the largest energy that it may have cost.
         """
         now, wanted = np.array(x), (np.array(steps) * self._unit)[:, None]
         for _ in range(missed):
@@ -625,11 +625,11 @@ def certified_couplings(
 
     `more` are the other arguments of `certified_coupling`.
 
-    A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on none.
-    It needs less damping than the previous coupling would need with these delays. It has the same kind or file; where
-    that is not certified or not softer, it is the spring-damper by Theorem 4, which has the strongest guarantee, or by
-    the user's own condition. If neither is possible, the list ends. Raises SafetyStop where the first coupling is not
-    certified.
+    A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on no
+    channel. It needs less damping than the previous coupling would need with the delays of the reserve. A reserve has
+    the kind of the first coupling, or comes from the same file. Where such a reserve is not certified or not softer, a
+    spring-damper is designed by Theorem 4, which has the strongest guarantee, or by the user's own condition. If this
+    fails, too, the list ends. Raises SafetyStop where the first coupling is not certified.
     """
     candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
     fallback = _FALLBACK if candidates[0].chosen.own is None else (_FALLBACK[0], condition)
@@ -651,8 +651,8 @@ _EQUAL = 1e-6  # relative difference up to which static stiffnesses count as equ
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
     """Return whether `reserve` needs less damping than `than`, is softer where its delay is longer, nowhere stiffer.
 
-    The damping is that of the loop with the reserve's delays. The stiffness is K, or, if one of the couplings has no K,
-    the static stiffness that the devices feel.
+    Both dampings are those required in the loop with the delays of `reserve`. The stiffness is K, or, if one of the
+    couplings has no K, the static stiffness that the devices feel.
     """
     own, other = (each.assessment.gains for each in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))

@@ -1,7 +1,4 @@
-"""Check encoders and motors: noise at rest, the answer to a test force, and motion while a session's forces act.
-
-A dead encoder looks like a handle at rest, but no hand holds a handle perfectly still while the force changes.
-"""
+"""Check encoders and motors: noise at rest, the answer to a test force, and motion while a session's forces act."""
 
 from __future__ import annotations
 
@@ -20,30 +17,32 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import Scenario
 
-_IMPULSE = 0.1  # [s] largest time integral of changes above 1 N without a motion, as a multiple of 1 N
+_IMPULSE = 0.1  # [s] longest time without a motion for which a force change of 1 N (EncoderMonitor: _newton) may act
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
-_PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions always mix
-_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if it needs over _TEST_FORCE; 0.4 with a one-sided motor
+_PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, the two directions always mix
+_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if its force exceeds _TEST_FORCE; a one-sided motor: 0.4
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio of a motion to the expected motion, or of the expected motion to it
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 2e-5 of a motion at 2 Hz
-_FIT = 0.8  # least share of power in the expected shape: loosely moved handles 0.93, held compliant devices at most 0.5
+#: least share of power in the expected shape; loosely moved handles have 0.93, held compliant devices at most 0.5
+_FIT = 0.8
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but no certificate covers a whole tick
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 #: least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09 with a rigid device of
 #: 40 g, 0.22 with those of omega-pair and 0.38 with a rigid device of 0.25 kg; dead motors leave 0.03
 _ALIVE = 0.06
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
-_ZONE = 0.8  # least ratio of a motion's relative size to that under twice the force; 1 without a dead zone
-_CLEAN, _RUBBED = 0.15, 0.25  # dead zones are judged up to this one-sided share and this ratio of friction to force
-_BETTER = 8.0  # a one-sided fault must explain this multiple of the squares that remain; friction and weight reach 6
+_ZONE = 0.8  # least ratio of motion / expected motion to its value under twice the force; 1 without a dead zone
+_CLEAN, _RUBBED = 0.15, 0.25  # a dead zone is judged up to this one-sided share, and up to this ratio friction / force
+#: a one-sided fault must explain this multiple of the squares that remain unexplained; friction and weight reach 6
+_BETTER = 8.0
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as moved to another place
-_SETTLED, _CALM = 0.5, 5e-4  # [s] time of rest before and after a person moves an axis; [m] largest motion in a rest
+_SETTLED, _CALM = 0.5, 5e-4  # [s] rest before and after a person moves an axis; [m] largest motion in a rest
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
-_PRESSING, _PRESSED = 0.3, 0.5  # force, as a multiple of 1 N; longest time [s] of rest under this force
+_PRESSING, _PRESSED = 0.3, 0.5  # least force in units of `_newton`; longest time [s] of rest under such a force
 _TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser counts the encoder looks dead
 
 
@@ -174,8 +173,8 @@ class Expected:
     def advance(self, axis: int, force: float) -> Array:
         """Apply the force [N] of the motor of `axis` for a tick, and return three positions [m] of this axis.
 
-        The first is the expected position. The second is in a hand as heavy as the device, if the handles are free. The
-        third is under the absolute values of all forces so far.
+        The first is the expected position. The second is expected in a hand as heavy as the device, if the handles are
+        free. The third is expected under the absolute values of all forces so far.
         """
         signed, absolute = self._B
         self._state = self._A @ self._state + signed[:, axis] * force + absolute[:, axis] * abs(force)
@@ -186,8 +185,8 @@ class _Fit(NamedTuple):
     """The least squares fit of some shapes to a motion."""
 
     shares: Array  # (k,) coefficients of the shapes
-    doubts: Array  # (k,) errors of the coefficients: sqrt(12) standard errors, which 0.05 % of normal errors exceed
-    explains: bool  # whether the last shape explains _BETTER times the squares in `rest`, less their noise
+    doubts: Array  # (k,) error bounds of the coefficients: sqrt(12) standard errors, with 0.05 % of normal errors above
+    explains: bool  # whether the last shape explains over _BETTER times the squares in `rest` that are not noise
     rest: float  # [m^2] sum of squares that remains
     fitted: Array  # (n,) [m]
 
@@ -238,9 +237,9 @@ class _Block:
         """Fit three sets of shapes to the motion of the tested axis.
 
         The first set has the expected motion, its rate and the motion under absolute forces; it gives the delay. With
-        a shape for dry friction the delay would be 6 times less certain, because both shift the phase. The other sets
-        have the first two shapes, the motion under a friction of 1 N, and that of a one-sided fault: of a motor (the
-        motion under absolute forces), or of an encoder that loses counts in one direction (the length of the path).
+        a shape for dry friction the delay would be 6 times less certain, because both shift the phase.
+        Each other set has the expected motion, its rate, the motion under a friction of 1 N, and a one-sided fault: of a
+        motor (the motion under absolute forces), or of an encoder that loses counts (the length of the path).
         """
         delay = _Fit.of(*self._motion, *self._shapes, self._even)
         fits = [delay]
@@ -255,25 +254,25 @@ class _Block:
 class EncoderTest:
     """Test whether encoders answer a small force that acts on one axis after the other.
 
-    Every 30 ms a pulse of 20 ms acts in the other direction, in blocks of 120 ms; each block is twice as strong as the
-    last. After a block, a polynomial of degree 5 is subtracted from every position. It contains the intended motion of
-    a hand in this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion
-    in shape (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder
-    gives the wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A
-    motion that comes later than expected shows a hidden delay, because friction and hands advance its phase. Dry
-    friction makes weak motions small, so only with the strongest force is a small motion wrong. Coarse counts leave the
-    delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
-    (`remarks`). A fit of dry friction finds a motor that is weak, or an encoder that loses counts, in one direction,
-    because friction under a weight gives the motion other shapes. A dead zone of a motor makes the relative size of a
-    motion smaller than that under twice the force; low friction does not.
+    In a block of 120 ms, pulses of 20 ms act every 30 ms in alternating directions; the next block is twice as strong.
+    After a block, a polynomial of degree 5 is subtracted from every position. It contains the intended motion of a hand
+    in this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion in shape
+    (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder gives the
+    wrong sign, a wrong scale the wrong size. A dead encoder and a held or moved handle give another shape. A late
+    motion shows a hidden delay, because friction and hands advance the phase of a motion. Dry friction makes weak
+    motions small, so only with the strongest force is a small motion wrong. Coarse counts leave the delay uncertain:
+    stronger forces follow until the error of the delay is small enough, or the delay is not tested (`remarks`). A fit
+    of dry friction finds a motor that is weak, or an encoder that loses counts, in one direction, because friction
+    under a weight gives other shapes. Under twice the force, a motor with a dead zone makes much more than twice the
+    motion; with low friction alone the motion is about twice as large.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
     in rehearsals (`held`). With unknown hands, two blocks in a row must agree, and blocks are repeated until the person
-    lets go, at most for 5 s. A small or late motion counts as wrong only where it has the shape of a free handle
-    and not that of a handle in a hand as heavy as the device. The mode of a transmission makes these shapes differ; a
-    rigid device has equal shapes. If an axis never moves as a free handle does, the session does not finish. Where it
-    swings at the frequency of the force, at any phase, the message asks to let go: a dead motor would not swing it.
+    lets go, at most for 5 s. A small or late motion then counts as wrong only if a free handle would have its shape and
+    a handle in a hand as heavy as the device would not. The two shapes differ for a device with a transmission; for a
+    rigid device they are equal. If an axis never moves as a free handle does, the session does not finish. If it swings
+    at the frequency of the force, at any phase, the message asks to let go: a dead motor would not swing it.
     """
 
     def __init__(
@@ -448,9 +447,9 @@ class EncoderMonitor:
 
     No living hand holds a handle within one count under a changing force; an encoder with one broken channel still
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
-    of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
+    of more than 1 N, or of half of a cap below 2 N, are integrated over time. A mass M whose motion a force change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
-    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. The
+    of more than 0.3 N, or 0.15 of a cap below 2 N, no hand holds still for half a second, because it has a tremor. The
     tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because
     friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c.
     """
@@ -458,7 +457,7 @@ class EncoderMonitor:
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
         """Take `still` (m,) [counts], the ranges in which the encoders rest."""
         self._lever, self._T, self._units, self._still, m = limits.lever, T, units, still, len(still)
-        #: (m,) [N] unit of force changes: 1 N, or half of the cap of a weak motor
+        #: (m,) [N] unit of force changes: 1 N, or half of a cap below 2 N
         self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]
         self._band: list[list[int]] | None = None
         tremor = _TREMOR / limits.lever

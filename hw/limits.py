@@ -22,8 +22,8 @@ from haptic_loop.models.device import require
 from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear loop
-_COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
+_FEWEST_STEPS = 16  # least number of force steps up to the cap; fewer steps make the loop nonlinear
+_COARSEST = 0.1  # coarsest encoder step, as a share of the largest displacement in a tick (`jump`)
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
 _HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last force; then a ramp [us]
@@ -75,7 +75,7 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    #: [m/s] fastest motion while forces act; with a drifting encoder and forces of 2 N, a handle stays below 1 m/s
+    #: [m/s] fastest motion while forces act; under 2 N and with a drifting encoder, a handle then stays below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
@@ -108,10 +108,10 @@ class SafetyLimits:
     ) -> _Shaped:
         """Shape `asked` (m,) [N], at a gain within [0, 1], into a force that may be sent after `previous` (m,) [N].
 
-        A vector that is capped keeps its direction. A vector with an axis above the slew rate moves straight towards
-        its goal, with its fastest axis at the slew rate.
+        A capped vector keeps its direction. A vector with an axis above the slew rate moves straight towards its goal,
+        with its fastest axis at the slew rate.
 
-        `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
+        `test` (m,) [N] is the force of the encoder test. It is added after the gain. Raises SafetyStop where
         `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
         """
         _require_finite(asked)
@@ -167,8 +167,8 @@ class SafetyLimits:
         """Raise SafetyStop where an axis jumped by more than `most` (m,) [m] between the second and third position.
 
         `path` has four displacements (m,) [m], with `gaps` [ticks] between them. A counting error leaves a pulse of the
-        mean speed between two positions. Its size is the smaller of the speeds gained and lost, times the middle gap. A
-        handle that reaches a stop only loses speed. `largest_pulse` explains which pulses a real motion can have.
+        mean speed between two positions. The size of the pulse is the smaller of the speeds gained and lost, times the
+        middle gap. A handle that reaches a stop only loses speed. `largest_pulse` bounds the pulses of real motions.
         """
         p, q, r = gaps
         for i, (a, b, c, d, allowed) in enumerate(zip(*path, most, strict=True), start=1):

@@ -33,12 +33,12 @@ from haptic_loop.hw.session_report import outcome
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.trace import Trace
 
-_MEASURE = 200  # answers that are timed; few suffice, because latencies are constant in virtual time
+_MEASURE = 200  # number of answers that are timed; it is low, because latencies are constant in virtual time
 #: The delay is chosen as in hw.bridge: it covers this share of the ages of measured answers, plus a guard [us].
 _QUANTILE, _GUARD_US = 0.99, 100.0
 _BEGIN = 5e-4  # [s] time from the device's first tick to the start of the session
 _GRACE_US = 50_000  # [us] time after the end of a session: a device must rest 30 ms after STOP (hw.session)
-_LONGEST = 60.0  # [s] longest virtual time in which a session connects, is armed and ends, in addition to its run
+_LONGEST = 60.0  # [s] longest virtual time of a session in addition to its run, to connect, arm and end
 _LATENCY_US = 60  # latency of one direction, which gives answers a median age of about 130 us
 
 Plan = Callable[[Ages], Sequence[Armable]]
@@ -91,7 +91,7 @@ class _Cable:
         """Advance the device by a tick."""
         rehearsal, emulator = self.rehearsal, self.emulator
         now, clock = rehearsal.now, round(rehearsal.now)
-        if clock < emulator.stalled_until:  # the ticks of a stall are skipped, not made up for
+        if clock < emulator.stalled_until:  # the ticks of a stall are skipped
             return rehearsal.at(emulator.stalled_until, self.tick)
         data = emulator.tick(clock)
         emulator.advance()
@@ -127,7 +127,7 @@ class Rehearsal:
     clock: float = 1.0  # length of the device's tick as a multiple of T
     keep: bool = True  # whether to record every tick of every device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
-    #: further boards, each with an emulator, length of a tick as a multiple of T, faults of its line, first tick [us]
+    #: further boards: emulator, length of a tick as a multiple of T, faults of the line, time of the first tick [us]
     further: Sequence[tuple[Emulator, float, tuple[FaultInjection, ...], float]] = ()
     moments: list[_Moment] = field(default_factory=list)
 
@@ -283,7 +283,7 @@ def rehearse(
     """Rehearse a session with the scenario's devices behind the real protocol, without device, port or waiting.
 
     The session connects, measures the delay, designs a coupling for it (or takes `coupling`), certifies the coupling,
-    arms, runs for `seconds`, and ramps out. Delays are the scenario's theta, or longer for a slow link. With
+    arms, runs for `seconds`, and ramps out. Delays are the scenario's theta; a slow link makes them longer. With
     `latch_on_arrival`, the device applies a force as soon as it comes. The loop then has the measured `latency` in
     addition to the scenario's theta, which may be 0. If no coupling is certified for the delay, the session is refused.
     A refusal is a result, not an error: see `stage` and `cause`.

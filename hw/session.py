@@ -27,7 +27,7 @@ _PATIENCE_US = 2_000_000  # longest wait for the answer to HELLO or CONFIG
 _ARMING_US = 600_000  # time per axis in which the device must arm and its encoders must pass their test
 _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimited during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
-_OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
+_OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest sum of hold and ramp
 STRONGEST = 12.0  # [N] largest force of a device at the hand, whatever a scenario allows
 #: default force cap [N] at the hand; a smaller one keeps free handles below this speed [m/s], whatever is faulty
 USUAL_CAP, FREE_SPEED = 1.3, 1.0
@@ -67,13 +67,13 @@ class Session:
         self.listen: Callable[[_Event], None] = lambda event: None
         self._expected = Expected(scenario, self.settings.held)
         self.missed_while_driving = 0  # ticks without an answer in time while the session drove
-        self.request: str | None = None  # what the person at the device has to do at the moment
+        self.request: str | None = None  # what the person at the device must do now
         self.now = self.entered = self.heard = 0  # [us] times of the last call, stage change, and new STATE or ACK
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
         self._axes: AxisCheck | None = None
         self._shutdown: _Shutdown | None = None
-        #: stage after a ramp-out: FINISHED while there is no fault, None to disarm and take a softer coupling
+        #: stage after a ramp-out: FINISHED without a fault, None if a softer coupling is to be armed
         self._after: Stage | None = Stage.FINISHED
 
     @property
@@ -160,8 +160,8 @@ class Session:
         """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
         After the ramp the motors are tested once more, if the settings request encoder tests. The session ends as
-        stopped if the user `let_go` of the deadman, if it was never armed, or if this test is impossible because no
-        force acts at the moment.
+        stopped if the user `let_go` of the deadman, if the session was never armed, or if no force acts at the moment,
+        so that this test is impossible.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -186,7 +186,7 @@ class Session:
         return () if self.stage in ENDED else self._end(stage, cause)
 
     def retract(self, doubt: str) -> None:
-        """Change the end of a session from finished to stopped, because of `doubt` about its forces."""
+        """Change the end of a session from finished to stopped, and add `doubt` to the cause."""
         self._enter(Stage.STOPPED, f"{self.cause}, but {doubt}")
 
     def estop(self, cause: str, now: int) -> Said:
@@ -394,7 +394,7 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 
 def axis_by_axis(scenario: Scenario) -> Scenario:
-    """Replace each full damping matrix Delta by a smaller diagonal one, because INFO has one number per axis.
+    """Replace each full damping matrix Delta by a smaller diagonal matrix, because INFO has one number per axis.
 
     The diagonal matrix is d D <= Delta with D = diag(Delta) and the least eigenvalue d of D^-1/2 Delta D^-1/2.
     """
