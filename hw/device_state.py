@@ -33,7 +33,7 @@ class Device:
         self.config: wire.Config | None = None
         self.k, self.now = 0, 0  # number of the current tick, and the clock [us] at its start
         self.zero = (0,) * info.axes
-        self.asked, self.ack = False, b""  # at the next tick: whether to send INFO, and the ACK to send
+        self.asked, self.ack = False, b""  # for the next tick: whether to send INFO, and the ACK to send
         self.clear()
         self.misses = 0
 

@@ -41,7 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at the device's full cap before the person starts to move; the host's gain may reach 1 later
+_SETTLED = 203  # ticks from the device's full cap to the start of the person's motion
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
@@ -196,8 +196,8 @@ class Line:
 class _EmulatedPlant:
     """Advance the devices and their passive humans between ticks by the matrix exponential.
 
-    The person starts to move at the first tick after `begin`, and holds still while `still` is true, so that a session
-    is armed at rest. With `coulomb` [N] every motor also has dry friction, which is updated eight times a tick.
+    The person starts to move at the first tick after `begin`, and holds still while `still` is true: sessions are armed
+    at rest. With `coulomb` [N] every motor also has dry friction, which is updated eight times a tick.
     """
 
     def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
@@ -304,7 +304,7 @@ class Emulator:
         self.stretch = 1.0  # length of a tick as a multiple of T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
         self._swapped, self._exchanged, self._crossed = False, False, 0.0
-        # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
+        # start of the tick [us], the remaining share of the tick, and whether the whole tick remains
         self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
         #: by axis and kind of fault: from the commanded to the true force

@@ -238,8 +238,8 @@ class _Block:
 
         The first set has the expected motion, its rate and the motion under absolute forces; it gives the delay. With
         a shape for dry friction the delay would be 6 times less certain, because both shift the phase.
-        Each other set has the expected motion, its rate, the motion under a friction of 1 N, and a one-sided fault: of a
-        motor (the motion under absolute forces), or of an encoder that loses counts (the length of the path).
+        Each other set has the expected motion, its rate, the motion under a friction of 1 N, and a one-sided fault: of
+        a motor (the motion under absolute forces), or of an encoder that loses counts (the length of the path).
         """
         delay = _Fit.of(*self._motion, *self._shapes, self._even)
         fits = [delay]

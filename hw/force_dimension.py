@@ -1,7 +1,8 @@
 """Drive Force Dimension devices, which have no clock, through the maker's library and its Python package.
 
-The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
-after the sample (theta = 0). The certificate covers the periods and latencies that the host measures at zero force.
+The host is the clock: it reads the position, computes a force and writes it. The force acts at once, a fraction of a
+period after the sample (theta = 0). The certificate covers the periods and latencies that the host measures at zero
+force.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # value of --port for these devices
 _PACKAGE = "forcedimension_core"
-_SATURATED = 2  # setForce returns this code when the motors cannot give the force
+_SATURATED = 2  # code that setForce returns when the motors cannot make the force
 _WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new force comes in this time
 _SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
 _COUNTS = 2**31  # a position in counts fits into 32 bits

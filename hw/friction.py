@@ -13,18 +13,18 @@ a + tau^2 - l tau, so the fit does not mistake it for negative damping. The fit 
 integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
 takes milliseconds. A fit needs no initial state.
 
-Dry friction g is c tanh(x'/v0) with a slip v0, or that of a bristle that bends over some distance (Dahl). Either has a
-part that vanishes at high speed (Stribeck). The law is not known, so all slips v0 of _SLIPS are tried, and all bristles
-of _BRISTLES that bend farther than an encoder step. Each fit includes a drag q >= 0; of b and q, only b is guaranteed.
-The periodic term holds forces and encoder errors that repeat with position (a motor's poles, an encoder's
+Dry friction g is c tanh(x'/v0) with a slip v0, or the friction of a bristle that bends over some distance (Dahl). Both
+laws have a part that vanishes at high speed (Stribeck). The law is not known, so all slips v0 of _SLIPS are tried, and
+all bristles of _BRISTLES that bend farther than an encoder step. Each fit includes a drag q >= 0; of b and q, only b is
+guaranteed. The periodic term holds forces and encoder errors that repeat with position (a motor's poles, an encoder's
 eccentricity). Their periods are searched in the residual.
 
 For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
-the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit
-almost as well as the best law, less the share SCALE.
+the damping that noise as strong as the residual could imitate. The final bound is the least bound of all laws that fit
+almost as well as the best law, reduced by the share SCALE.
 
-The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
-with such friction, b is a lower bound at every speed.
+The power that dry and viscous friction dissipate, divided by the speed squared, is least at high speed, where only b is
+left. So b is a lower bound of the damping at every speed.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 
 #: [m] distances over which a bristle's friction grows from 0 to its limit (Dahl 1968)
 _BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)
 _STRIBECK = 0.02  # [m/s] speed at which the Stribeck part has fallen to 37 %
-_SLOW, _WEAK = 0.2, 0.05  # h must pass this share of a force; a force below this share of the strongest is not checked
+_SLOW, _WEAK = 0.2, 0.05  # share of a force that h must pass; share of the strongest force from which this is checked
 _SLIP = 0.002  # [m/s] slip assumed in `dry_friction` if the best law is a bristle
 _BLOCKS = 10  # parts of the record that are left out in turn
-_HIDDEN = 0.03  # the bound is reduced by this share of the damping that the residual could hide
+_HIDDEN = 0.03  # share of the damping that the residual could hide, which is subtracted from the bound
 #: relative error of the encoder's scale, which no record shows; eccentricity of 20 um in a turn of 40 mm gives 3e-3
 SCALE = 5e-3
 _QUANTILE = 1.833  # one-sided 95 % quantile of Student's t with 9 degrees of freedom
@@ -63,7 +63,7 @@ _ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
 _NEAR = np.geomspace(0.92, 1.09, 24)  # multiples of the best of these periods, searched next
 _PERIODIC = 4  # largest number of periodic disturbances in a fit
-_CHANCE = 2.0  # least gain of log likelihood by a periodic pair, beyond the gain of the best pair in pure noise
+_CHANCE = 2.0  # least gain of log likelihood by a periodic pair, in excess of the best pair's gain in pure noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
 
@@ -139,8 +139,8 @@ def _bristle(x: Array, reach: float) -> Array:
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
     """Return the ticks at which the force is weak, or h passes enough of it.
 
-    At the other ticks most of the force is faster than h passes. The fast motion that it causes changes the mean
-    friction, but is missing in the filtered balance.
+    At the other ticks, most of the force is too fast for h. It causes a fast motion, which changes the mean friction
+    but is missing in the filtered balance.
     """
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())

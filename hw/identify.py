@@ -1,7 +1,7 @@
 """Estimate mass, friction and transmission of one axis from a record of forces and displacements; bound its damping.
 
-The excitation is a chirp of a small force, slow motions, a swing that reaches the speed of a session, a chirp of the
-swing's force, and silence (see `chirp`). This force does not depend on the motion, so it closes no loop and needs no
+The excitation is a chirp of a small force, slow motions, a swing that reaches the speed of a session, a chirp with the
+force of the swing, and silence (`chirp`). This force does not depend on the motion, so it closes no loop and needs no
 certificate. Mass and friction come from the balance of forces (hw/friction.py). Damping that falls with speed or
 frequency is refused (hw/viscosity.py). The transmission is fitted to the spectra of the motion and of the force less
 dry friction.
@@ -28,7 +28,7 @@ from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, fitted, starts, 
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
-_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length / `seconds`
+_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep with the swing's force, and its length over `seconds`
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as shares of the largest
 _CYCLES = 3  # cycles of the swing at each amplitude
 _LEAD = 0.3  # [s] of zero force, while the gain rises
@@ -51,7 +51,7 @@ class Excitation:
     signal: Array  # (ticks, m) [N]
     T: float  # [s]
     link: int  # [ticks]
-    margin_us: float = 0.0  # a force is late only after its latch
+    margin_us: float = 0.0  # a force that comes before its latch is not late
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signal", frozen(self.signal, 2))
@@ -95,7 +95,7 @@ class Swing:
     def of(cls, scenario: Scenario, speed: float, travel: float) -> Swing:
         """Return a swing that reaches `speed` [m/s] within +-`travel` [m] for the scenario's mass and damping.
 
-        Its forces stay within the device's limits; an axis that would need more stays slower.
+        Its forces stay within the device's limits; an axis that would need a larger force stays slower.
         """
         w = speed / travel
         need = [
@@ -123,11 +123,11 @@ def chirp(
     """Return the force to play: zero for 0.3 s, cosines of exponentially rising frequency, a swing, then silence.
 
     The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each of
-    these three takes `seconds`, and the silence takes half of that. Two slow motions at two levels of force show
-    friction that is not viscous, and the swing between them shows it at the speed of a session. A long cosine at the
-    swing's force follows the swing and shows how damping changes with frequency. Each part ends at a whole cycle, so
-    that a free mass does not drift away. The last one ends a quarter of a cycle later, so that the device is released
-    while it moves.
+    these three cosines takes `seconds`, and the silence takes half of this time. Two slow motions at two levels of
+    force show friction that is not viscous, and the swing between them shows it at the speed of a session. After the
+    swing, a long cosine with the force of the swing shows how damping changes with frequency. Each part ends at a whole
+    cycle, so that a free mass does not drift away. Only the last part ends a quarter of a cycle later, so that the
+    device is released while it moves.
     """
 
     def sweep(low: float, high: float, further: float = 0.0, times: int = 1) -> Array:
@@ -178,7 +178,7 @@ class Estimate:
 def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: float = 1.0) -> Estimate:
     """Fit one axis to displacements x (N,) [m] under motor forces (N,) [N] of period T [s], with encoder `step` [m].
 
-    Radians and N m of an axis that a hand holds at the radius `lever` [m] are fitted as metres and N at the hand.
+    Radians and N m of a rotary axis are converted to metres and N at the hand, whose radius is `lever` [m], and fitted.
 
     Raises ValueError where the device did not move, a hand holds it, the bound of its damping is 0, or its damping
     falls with speed or frequency.
@@ -227,8 +227,8 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
     """Return warnings for axes with over 10 % more damping than INFO and the scenario declare.
 
-    A smaller excess gives no warning: estimates of a correct device scatter about the declared value, and one bound in
-    twenty lies above it.
+    A smaller excess gives no warning: estimates of a correct device scatter about the declared damping, and one bound
+    in twenty exceeds the damping.
     """
     causes = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
@@ -244,7 +244,7 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
     """Return one estimate per axis from two or more recordings (sittings), and warnings of recordings damped by a hand.
 
     Each axis gets the estimate of its least damped recording, and the least bound of all recordings. A passive hand
-    only adds damping (docs/hardware.md), so no hand damped the least damped recording, unless a hand damped them all.
+    only adds damping, so no hand damped the least damped recording, unless a hand damped all recordings.
     Raises ValueError for one recording, or where no other recording agrees with the least damped one.
     """
     if len(sittings) < 2:

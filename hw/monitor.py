@@ -1,4 +1,4 @@
-"""Check that link and device behave as the certificate assumes: measured delay, clock, lateness, applied forces.
+"""Check that link and device behave as the certificate assumes: delay, clocks, late answers and applied forces.
 
 The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the clocks of
 device and host are compared with the tick number, and late and missing answers are counted. The force that the device
@@ -19,9 +19,9 @@ import numpy as np
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 
 _LATE = 0.1  # largest share of late answers; above it the link is slower than the coupling is certified for
-_MISSED = 0.2  # largest share of missing answers; beyond it loops lose mean-square stability
-_STATES_PER_ANSWER = 8  # most STATEs per measured age: of several FORCEs in a USB frame, only one margin is reported
-_INFERRED = 0.005  # largest share of inferred ages: half of the 1 % that the default quantile leaves out
+_MISSED = 0.2  # largest share of missing answers; loops with a larger share may lose mean-square stability
+_STATES_PER_ANSWER = 8  # most STATEs per measured age: a STATE reports one margin for all FORCEs of a USB frame
+_INFERRED = 0.005  # largest share of inferred ages: half of the 1 % of ages that the default quantile leaves out
 _UNTOLD = 0.9  # largest share of STATEs without a margin; USB frames that carry several FORCEs cause some
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
 _BLOCK = 200  # ticks over which clocks are compared, and late and missing answers are counted
@@ -96,8 +96,8 @@ class AnswerAges:
     """The age of each answer, derived from STATEs and stored under the number of the answered tick.
 
     A STATE reports the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
-    advances by n, and the n-1 skipped answers are up to (n-1) T older. The skipped answers count with these ages,
-    because the delay must cover them too.
+    advances by n, and the other n-1 answers are up to (n-1) T older. They count with these larger ages, because the
+    delay must cover these answers, too.
     """
 
     def __init__(self, due: int, T_us: float) -> None:
@@ -135,11 +135,11 @@ class AnswerAges:
 class Measurement:
     """Measure the ages of answers at zero force, until `needed` answers have arrived or are missing.
 
-    A limit on the number of STATEs ends the measurement in any case. Where too many ages are inferred, answers may
-    have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
-    round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
-    same, but it sends most answers for a wrong tick, so that the device ignores them. The distances of accepted answers
-    are random and at least the longest age (at most theta), so that bursts meet each answer with the same probability.
+    A limit on the number of STATEs ends the measurement in any case. Where too many ages are inferred, a late answer
+    may have come together with a younger answer, which hides it. Then a second round measures half as many ages
+    exactly. The host still answers every STATE, so that the load of the link is the same, but it sends most answers for
+    a wrong tick, so that the device ignores them. The distances of accepted answers are random, so that bursts meet
+    each answer with the same probability. A distance is at least the longest age, but not more than theta.
     """
 
     def __init__(self, needed: int, theta: int, T: float) -> None:
@@ -275,7 +275,7 @@ class LinkMonitor:
     def take(self, state: State, ignored: Container[int] = ()) -> int:
         """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick.
 
-        A latch in `ignored` (modulo 2^16) is no miss, because the host sent its answer for a wrong tick on purpose.
+        A tick in `ignored` (modulo 2^16) is not missed, because the host sent its answer for a wrong tick on purpose.
         """
         ahead = 1 if self.last is None else distance(state.tick, self.last.tick)
         if ahead <= 0:
@@ -325,13 +325,13 @@ class LinkMonitor:
         return f"{100 * late:.0f} % of the last {_BLOCK} answers were late" if late > _LATE else None
 
 
-# The clocks of device and host are both compared with the tick number. Only the host's clock reveals a device that
-# computes its clock from its ticks.
+# The clocks of device and host are both compared with the tick number. A device may compute its clock from its ticks;
+# then only the host's clock reveals wrong ticks.
 
 
 @dataclass
 class _ClockDrift:
-    """Compare a clock with ticks of `T_us` in blocks. Each block excludes its longest delay: a freeze is no drift."""
+    """Compare a clock with ticks of `T_us` in blocks. Each block excludes its longest delay, which may be a freeze."""
 
     whose: str
     T_us: float

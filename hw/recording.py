@@ -1,7 +1,7 @@
 """The record of a session: its trace, and the replay of the trace through the controller, bit by bit.
 
-A trace is the npz of sim.run with arrays of the link added. Its metadata hold the recipe for the replay (the limits,
-coupling and scenario of every arming); a MuJoCo world cannot be replayed. A digest detects changes of the file.
+A trace is the npz of sim.run with arrays of the link added. Its metadata have a recipe for the replay of every arming:
+limits, coupling and scenario. A MuJoCo world cannot be replayed. A digest detects changes of the file.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Recorder:
 
 
 def _digest(arrays: Mapping[str, Array]) -> str:
-    """Return the SHA-256 of everything in a trace, which detects a changed, cut or merged record."""
+    """Return the SHA-256 of all arrays of a trace, which detects a changed, cut or merged record."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())

@@ -36,7 +36,7 @@ class IncidentLog:
     """A log file that is complete up to the last second, however the process ends.
 
     Each line is a JSON object. Every entry of the session's log is written at once, the session's state every second.
-    The lines survive SIGKILL, but may not survive a power failure.
+    The lines survive SIGKILL, but not always a power failure.
     """
 
     def __init__(self, path: Path) -> None:
@@ -180,7 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """Return the report of an ended session. First change its end from finished to stopped if `_doubt` has a reason."""
+    """Return the report of an ended session, whose end becomes stopped instead of finished if `_doubt` has a reason."""
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
     steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []
@@ -230,7 +230,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
 
 
 def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
-    """Return the ages [us] of answers and skipped answers (`AnswerAges`); `dues` has a delay [ticks] per arming."""
+    """Return the ages [us] of all answers, as `AnswerAges` infers them; `dues` has a delay [ticks] per arming."""
     ages: list[int] = []
     for i, due in enumerate(dues):
         rows = link["arming"] == i

@@ -1,12 +1,13 @@
 """Bound a motor's mass and its transmission from records with the handle free and with the handle clamped.
 
 The known-device conditions need these bounds: the least mass at the motor, the largest stiffness k of the transmission,
-and the least and the largest of its damping b. With a clamped handle, motor and transmission are a mass on a spring and
-a damper. With a free handle, the motor's own damping slows all motion, and b damps only the mode between motor and
-handle. One model is fitted to the spectra of all records together, with clamped records at two levels of force.
+and the least and the largest value of its damping b. With a clamped handle, motor and transmission are a mass on a
+spring and a damper. With a free handle, the motor's own damping slows all motion, and b damps only the mode between
+motor and handle. One model is fitted to the spectra of all records together, with clamped records at two levels of
+force.
 
 Each bound is the estimate, moved by two standard errors (95 %) and by 0.5 % for the scale of the encoder. The standard
-errors come from fits that each omit a part of one record's frequencies, so they include the errors of the model.
+errors come from fits that omit a part of one record's frequencies, so they include the errors of the model.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _TOLD = 0.01  # allowed error of the model, as a share of the motion; the encode
 _UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
 _SIGMAS, _SCALE = 2.0, 0.005  # standard errors, and relative error of the encoder, by which bounds are moved
-_WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
+_WITHIN = (2.0, 0.85)  # multiples of the lowest and of the highest frequency that must enclose the clamped mode
 _STEPS = 60  # most evaluations in a fit
 _LATE = 0.05  # [T] largest sum of lag and delay of a force, such as a current loop's; no proof covers a larger one
 _FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # lower bounds of log m1, log m2, log k, log b, delta and lag
@@ -52,7 +53,7 @@ class _Joint:
     """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay].
 
     m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
-    is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model has d for b, and b for delta.
+    is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model writes d for b, and b for delta.
     """
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:

@@ -1,7 +1,7 @@
 """Run a session in real time, in one thread that waits only for the device, and open serial ports (pyserial).
 
-A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So gc.freeze() excludes the loaded objects, and the
-collector is off during the session.
+A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So gc.freeze() excludes the loaded objects from
+collections, and the collector is off during the session.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from haptic_loop.hw.protocol import SafetyStop
 from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
 
-_CHUNK = 4096  # bytes read at once; a tick brings a few dozen
+_CHUNK = 4096  # most bytes read at once; a tick brings a few dozen bytes
 _UNUSED = 9600  # baud rate for a port without UART, where it has no effect; but 1200 resets many boards
 _STALL_SECONDS, _STALL_MS = 2.0, 2.0  # duration of the measurement of stalls; the least stall that gives a warning
 _GRACE_US = 50_000  # time after the end in which a lost STOP is repeated

@@ -1,8 +1,8 @@
 """Test whether the damping of an axis is the same at every speed and at every frequency of a record.
 
 The bound of hw/friction.py assumes that one number b describes the damping. Friction that thins with speed (grease), or
-that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no such number. It damps less at the speeds
-and frequencies where a session needs the damping. A record that shows either kind of friction is refused.
+that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no such number. At the speeds and frequencies
+of a session it damps less than in slow motion. A record that shows either kind of friction is refused.
 
 Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the work of the
 motor is W = b S2 + g S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, g is dry friction, f0 a
@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
-_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed, because dry friction is then saturated
+_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed, which saturates dry friction
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
 #: [s] time constants of a memory; one of 1 ms counts as damping, as encoders of 5 um at 0.25 kg do not show it
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, 1 N causes less motion than an encoder of 5 um resolves
-_LOUD = 0.05  # least force at a frequency, as a share of the strongest in the band
+_LOUD = 0.05  # least force at a frequency, as a share of the largest force at a frequency of the band
 _POINTS = 200  # frequencies of a first, rough fit
 _ALIASES = (-1, 0, 1)  # sampling adds frequencies at multiples of 1/T; further multiples add below 1e-3 of the response
 _MODES_HZ = np.geomspace(20.0, 300.0, 40)  # initial frequencies of a transmission's mode
@@ -163,8 +163,8 @@ class Spectra:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c, end] and a memory of `tau` [s].
 
         m1 and m2 [kg] are motor and handle, k [N/m] and d [N s/m] the transmission between them. The model assumes
-        that a force `end` [N] in one more tick stops the motion left at the end of the record. Entries that p lacks
-        at its end are 0.
+        that a force `end` [N] in one more tick stops the motion left at the end of the record. A shorter p is filled up
+        with zeros.
         """
         (m1, m2, k, d), (b, lag, late, c, end), s = *_parameters(p), self._s
         link = k + d * s
@@ -231,8 +231,8 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
     """Return the least lower bound of b [N s/m] over all tau, its tau [s], and whether the record shows a memory.
 
-    `force` is that of the motor less `nonviscous`. The model without memory is fitted to all frequencies. A small
-    Maxwell element changes the motion little beside the mass, so its effect is linear in c, and each tau takes one
+    `force` is the force of the motor less `nonviscous`. The model without memory is fitted to all frequencies. A small
+    Maxwell element changes the motion less than the mass does, so its effect is linear in c, and each tau takes one
     linear fit. But the lag and the transmission of the model without memory may imitate a large element. So all
     parameters are also fitted from starts with most of the damping in the element. Such a fit counts if it explains
     the record about as well as the model without memory.
