@@ -5,10 +5,10 @@
     environment= function        the scene, a separate simulation, behind a certified coupling and an energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. The energy of a pair of hands grows if
-hands and devices receive, beyond what the devices' damping dissipates, more than the 2 mJ of the shell and, with
-environment.world, the energy that gravity and springs released. A pair shakes if, in the last fifth of the run, a force
-changes by more than a tenth of the limit in a tick.
+A hand is a mass that is thrown at the scene, on a lossless spring to a fixed place. The energy of a pair of hands grows
+if hands and devices receive more than W0 beyond what the devices' damping dissipates. W0 is the 2 mJ of the shell; with
+environment.world the energy that gravity and springs released is added. A pair shakes if, in the last fifth of the run,
+a force changes by more than a tenth of the limit in a tick.
 """
 
 import sys
