@@ -35,7 +35,7 @@ from haptic_loop.design.worst_member import Progress
 if TYPE_CHECKING:
     from haptic_loop.design.coverage import SwitchingFigures
 
-LONGEST_DELAY = 100  # samples; beyond it a sweep takes seconds, and no device has enough damping
+LONGEST_DELAY = 100  # samples; with longer delays a sweep takes seconds, and no device has enough damping
 
 
 def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
@@ -76,7 +76,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 #: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device's values.
 _STIFFEST, _LONGEST_PERIOD, _MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
-_EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
+_EDGE = 1e-7  # relative accuracy of the edge between certified and uncertified values
 _SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; larger ones may be a jump.
 
 
@@ -341,7 +341,7 @@ class Audit:
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
     switching: SwitchingFigures | None  # None for constant delays
     helps: list[Help]  # empty for delays that switch, for which no change is searched
-    constant: dict[str, Requirement] = off_table("left out")  # the requirements to which `margins` belong
+    constant: dict[str, Requirement] = off_table("left out")  # by condition, in the loop to which `margins` belong
     not_covered: str = CAVEATS
     left_over: LeftOver | None = off_table("if given", None)  # the damping of Theorem A for known devices
 
@@ -377,8 +377,8 @@ def audit(
 
         switching = SwitchingFigures.of(loop, coupling, needs["switching"])
         needs = {name: each.judge(constant, coupling) for name, each in conditions.items()}
-    others = {name: each for name, each in conditions.items() if each is not wanted}
-    margins = {name: _margins(constant, coupling, each, needs[name]) for name, each in others.items()}
+    others = [each for each in conditions.values() if each is not wanted]
+    margins = {each.name: _margins(constant, coupling, each, needs[each.name]) for each in others}
     margins[wanted.name], helps = searched.result()
     return Audit(
         assessment,
