@@ -8,7 +8,6 @@ G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of syste
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -85,7 +84,7 @@ class Coupling:
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
     def in_series(self, T: Number) -> Lti | None:
-        """Return a block with the poles that a coupling in series adds to the environment; None for feedback."""
+        """Return a block with the poles that a coupling in series adds to the loop; None for a coupling in feedback."""
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
@@ -202,10 +201,6 @@ class _MatrixSpringDamper(ReadOnly, Coupling):
 
     kind = "matrix-spring-damper"
 
-    if TYPE_CHECKING:
-
-        def __init__(self, K: ArrayLike, B: ArrayLike) -> None: ...
-
     def __post_init__(self) -> None:
         for name in "KB":
             object.__setattr__(self, name, frozen(getattr(self, name), 2, name))
@@ -271,10 +266,6 @@ class MovingAverage(ReadOnly, Coupling):
     constant: Array  # (m,) [m/N]
 
     kind, one_period = "moving-average", True
-
-    if TYPE_CHECKING:
-
-        def __init__(self, weight: ArrayLike, terms: Sequence[int], constant: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         for name in ("weight", "constant"):
@@ -344,10 +335,10 @@ def _decimals(M: Array, digits: int) -> Array:
 class ForceFilter(ReadOnly, Coupling):
     """A filter R(z) of the environment's forces: F = Theta R Psi E.
 
-    There is no feedback, so F is stable if R and the environment are, and F is affine in R.
-    R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
-    coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric if E(1) is.
-    R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
+    There is no feedback, so F is stable if R and the environment are stable, and F is affine in R. R(z) is the sum of
+    R_k b_k(z) with the functions b_k of `basis`, which are 1 at z = 1. The coefficients, taken as decimals, sum to
+    R(1) = g I exactly, so that F(1) = g E(1) is symmetric if E(1) is symmetric. R_k has one column for the force of
+    each channel, and optionally one more for the sum of all forces.
 
     Raises:
         ValueError: A pole is not stable, a shape does not match, an entry of R exceeds 1e9, or the coefficients do not
@@ -359,10 +350,6 @@ class ForceFilter(ReadOnly, Coupling):
     R: Array  # (1 + n + 2 p, m, m) or (1 + n + 2 p, m, m + 1), dimensionless
 
     kind, holds_model, one_period = "force-filter", True, True
-
-    if TYPE_CHECKING:
-
-        def __init__(self, poles: ArrayLike, pairs: ArrayLike, R: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "poles", frozen(self.poles, 1, "poles"))
@@ -469,9 +456,9 @@ def _own_columns(R: Array) -> Array:
 def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
-    Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The states of
-    the chain for the sum of all inputs are sums over the chains of the inputs, up to the length of the shortest chain.
-    Only the states of the sum's chain beyond this length are added.
+    Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The chain for
+    the sum of all inputs needs few states of its own: up to the length of the shortest input's chain, its states are
+    sums of the states of the inputs' chains. Only its states beyond this length are added.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size
@@ -582,7 +569,7 @@ class _MovingAverageForm(_Form, frozen=True, tag="moving-average"):
         return "weight", len(self.weight)
 
     def build(self, T: float) -> MovingAverage:
-        return MovingAverage(self.weight, self.terms, self.constant)
+        return MovingAverage(np.array(self.weight), self.terms, np.array(self.constant))
 
 
 class _ComplianceForm(_Form, frozen=True, tag="compliance"):
@@ -617,7 +604,7 @@ class _ForceFilterForm(_Form, frozen=True, tag="force-filter"):
         return "R", len(self.R[0]), len(self.R[0])
 
     def build(self, T: float) -> ForceFilter:
-        return ForceFilter(self.poles, self.pairs, self.R)
+        return ForceFilter(np.array(self.poles), np.array(self.pairs), np.array(self.R))
 
 
 Form = _NoForm | _SpringDamperForm | _MatrixSpringDamperForm | _MovingAverageForm | _ComplianceForm | _ForceFilterForm

@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self, cast
+from typing import Self, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from haptic_loop.controller.complementarity import BallProblem, BoxProblem, Complementarity, magnitudes
 from haptic_loop.controller.delay import delay
@@ -240,19 +240,6 @@ class Limiter(Law):
     limit: Array  # (m,) [N], inf without a limit; the same for all channels of a ball
     rho: Array  # (m,) [N/m] resists changes of the slip; 0 for any-environment with psi = 0, else a share of delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
-
-    if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold
-
-        def __init__(
-            self,
-            sent: Lti,
-            theta: Sequence[int] = (),
-            walls: tuple[Wall, ...] = (),
-            *,
-            limit: ArrayLike,
-            rho: ArrayLike,
-            balls: Sequence[slice] = (),
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         super().__post_init__()

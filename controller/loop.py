@@ -286,7 +286,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         sent = self.walled_before_delay(coupling)
         if limit is None or rho is None:
             return Law(sent, self.theta, walls)
-        return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))
+        return Limiter(sent, self.theta, walls, limit=np.array(limit), rho=np.array(rho), balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
         """Return the environment, and the vertices of its ranges or 128 of these vertices (controller.ranges)."""

@@ -142,7 +142,8 @@ def _limited_block(
     rho = limiter_rho(stored.loop, stored.certificate)
     if rho is None:
         raise ValueError("the certificate covers no limited forces: design the coupling anew, or omit --force-limit")
-    limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho, balls=balls)
+    sent, limit = loop.sent(stored.built()), np.array(force_limit)
+    limiter = Limiter(sent, loop.theta, limit=limit, rho=np.array(rho), balls=tuple(balls))
     limited = "Lengths of a device's force vector" if balls else "Forces"
     about = (
         f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
