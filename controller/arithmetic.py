@@ -130,7 +130,7 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return a controller of the BLAS libraries of NumPy and SciPy, which must be loaded to be controlled.
+    """Return a controller of the BLAS libraries of NumPy and SciPy. It can control only libraries that are loaded.
 
     With OPENBLAS_NUM_THREADS=1 SciPy's library uses one thread anyway and need not be loaded.
     """
@@ -294,8 +294,8 @@ def solve(M: Array, right: Array) -> Array:
 def _solve_exactly(M: Any, right: Any) -> Any:
     """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
-    The next pivot is in the row with the fewest entries, and there in the column with the fewest entries (Markowitz),
-    so that few zeros become nonzero.
+    The next pivot is in the row with the fewest entries. In this row it is in the column with the fewest entries
+    (Markowitz). So few zeros become nonzero.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]

@@ -10,9 +10,9 @@ its principal axes), and Delta' = (1 - eps) Delta = diag(delta'). On vectors, ' 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
 A tick with force a lowers W by at most its loss r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the sum of the losses of
-all forces that are sent but have not acted. A packet is sent as s times the wanted force, with the largest s in [0, 1]
-for which R <= W. Then W >= 0 always, and beyond the energy that the devices dissipate, devices and hands receive at
-most W0. docs/energy-budget.md has the proofs, the terms for encoder steps, and conditions under which no budget acts.
+all forces that were sent and have not acted yet. A packet is sent as s times the wanted force, with the largest s in
+[0, 1] for which R <= W. Then W >= 0 always, and beyond the energy that the devices dissipate, devices and hands receive
+at most W0. docs/energy-budget.md has the proofs, the terms for encoder steps, and the cases in which no budget acts.
 
 *Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost. After that the
 device must set its force to zero. Unless the budget knows which force acted (constant delays, or a report from the

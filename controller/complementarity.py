@@ -155,7 +155,7 @@ class BoxProblem(_Problem):
         return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
     def _listed(self, q: Array) -> tuple[Array, Array]:
-        """Return (v, f) of the active set whose least slack is largest; it is nonnegative at the solution only."""
+        """Return (v, f) of the active set whose least slack is largest. Only the solution's slack is nonnegative."""
         signs, by_q, by_one, room, room_one = self._candidates
         n, k = q.shape
         best = (room @ q + room_one).reshape(len(signs), 2 * n, k).min(axis=1).argmax(axis=0)

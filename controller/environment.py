@@ -128,9 +128,9 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
     A block must be stable, and passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1)
-    symmetric and positive semidefinite. If passivity holds within rounding only, `at` makes E(1) symmetric and adds a
-    spring of at most 1e-6 of the block's mean gain to D. Raises ValueError for other blocks, or if passivity cannot be
-    decided.
+    symmetric and positive semidefinite. Here He M = (M + M*)/2. If passivity holds within rounding
+    only, `at` makes E(1) symmetric and adds a spring of at most 1e-6 of the block's mean gain to D. Raises ValueError
+    for other blocks, or if passivity cannot be decided.
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -309,7 +309,7 @@ RIGID_WALL = RigidWall.RIGID_WALL
 
 
 class _NoModel(SingularLoop):
-    """The environment has no known E(z), so that this-environment does not apply."""
+    """The environment has no known E(z), so that the condition this-environment does not apply."""
 
     def __init__(self) -> None:
         super().__init__(_NO_MODEL)
@@ -612,7 +612,7 @@ _SLACK = 1e-9  # smaller eigenvalues, relative to the largest one, come from the
 
 
 def _check_directions(lengths: Sequence[Sequence[tuple[str, float]]], inner: dict[str, int], free: int) -> None:
-    """Raise ValueError if more than `free` directions (a number) are free within rounding."""
+    """Raise ValueError if more directions than the exact number `free` are free within rounding."""
     rows = np.zeros((len(lengths), len(inner)))
     for row, ends in zip(rows, lengths, strict=True):
         for node, sign in ends:

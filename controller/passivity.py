@@ -12,7 +12,7 @@ from haptic_loop.controller.lti import Array, Lti
 _FIRST = 64  # number of intervals of [0, pi] at the start
 #: largest number of evaluations for up to 8 states, which take half a second; more states are allowed fewer
 _EVALUATIONS = 1 << 15
-_REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|(zI - A)^-1|
+_REACH = 0.5  # a bound is computed for half-widths up to _REACH/|(zI - A)^-1|
 _UNIT = 2.0**-53  # largest relative error of one rounding
 _NOISE = 1e-4  # covariance of the noise in every state, relative to that of the noise at the inputs
 _INFLATED = 1.001  # factor on norms against rounding

@@ -87,11 +87,11 @@ def number_of_vertices(network: Network, ranges: Ranges) -> int:
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that include a linear code.
 
-    Each bit of a corner's number is the parity of the bitwise AND of the code word's number and a mask. All masks have
-    the highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
-    pairs of ends meet in every combination, unless one belongs to a part with ranges that may also be absent.
-    Such a part usually has 3 or 5 corners: several words give the same vertex, and some combinations may be missing.
-    Random vertices then replace these words.
+    The code has 128 words, numbered from 0. Each bit of a corner's number has a mask, and equals the parity of the
+    bitwise AND of the word's number and this mask. All masks have the highest bit, so that the sum of two masks is
+    never a mask. Any three masks are therefore independent, and any three pairs of ends meet in every combination.
+    A spring with ranges that may also be absent is an exception. It usually has 3 or 5 corners, so that several words
+    give the same vertex, and some combinations may be missing. Random vertices then replace these words.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:

@@ -33,13 +33,14 @@ RunBlock = Callable[[int], None]  # runs a number of ticks from row 0 of a `Step
 
 _PART = 128  # number of ticks whose rows fit into the cache
 _ROUNDED = 1e-14  # relative rounding error of a force vector that was scaled to its limit
-_CALM = 1 - 1e-9  # forces above this multiple of their limit may need the limiter
+_CALM = 1 - 1e-9  # a force above this multiple of its limit may need the limiter
 
 
 class Net(Protocol):
-    """A passivity layer: a nonlinear step with memory between the law's forces and the devices, one per `StepBuffer`.
+    """A passivity layer: a nonlinear step with memory between the law's forces and the devices.
 
-    At every tick `send` changes forces (m, nsim) [N] in place before the delays, and `apply` after them.
+    Every `StepBuffer` has its own net. At every tick `send` changes forces (m, nsim) [N] in place before the delays,
+    and `apply` after them.
     """
 
     def send(self, x: Array, force: Array, /) -> None:

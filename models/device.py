@@ -16,7 +16,7 @@ from haptic_loop.controller.loop import DeviceBounds
 
 
 def require(field: str, value: float, low: float, high: float, unit: str) -> None:
-    """Raise ValueError unless low <= value <= high (nan is refused), TypeError for anything but a number."""
+    """Raise ValueError unless low <= value <= high (nan is refused, too), and TypeError if `value` is not a number."""
     if not isinstance(value, Real):
         raise TypeError(f"{field} is {value!r}, expected a number")
     if not low <= value <= high:
@@ -24,17 +24,20 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m] largest damping of a device
-_LEAST_EIGENVALUE = 1e-9  # [N s/m] allowed in a damping matrix: far below any device's damping, above rounding errors
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below the damping of any device, above rounding errors
 AXES = ("x", "y", "z")
 
-#: A number for all axes or one per axis; `_Levels` may also be a symmetric matrix.
+#: `_PerAxis` is one number for all axes, or one number per axis. `_Levels` may also be a symmetric matrix.
 _PerAxis = float | tuple[float, ...]
 _Levels = float | tuple[float | tuple[float, ...], ...]
 _Matrix = NDArray[np.float64]
 
 
 def symmetric(field: str, value: Any, axes: int) -> _Matrix:
-    """Convert a number, a list of one per axis or a symmetric matrix to (axes, axes). Raises ValueError for others."""
+    """Return the matrix (axes, axes) of a number, of a list with one number per axis, or of a symmetric matrix.
+
+    Raises ValueError for any other value.
+    """
     if isinstance(value, Real):
         number = float(value)
         if not np.isfinite(number):
@@ -67,13 +70,13 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
     """The fields and properties that both kinds of devices have."""
 
     damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
-    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
+    force_limit: _PerAxis = 12.0  # [N] CHAI3D's number for omega.3; one number limits the vector, a list each axis
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
-    delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
+    delta: _Levels | None = None  # [N s/m] guaranteed damping, such as an identified bound; None means `damping`
     credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
-    # From a study's abstract: teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
+    # In a study, teleoperation masters moved faster than 0.7 m/s in a fifth of the fast part of a tapping task.
     guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use; refused for a rigid device
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
@@ -89,7 +92,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
 
     @property
     def free(self) -> tuple[int, ...]:
-        """The axes that are not clamped, counted from 0: one channel each."""
+        """The numbers of the axes that are not clamped, counted from 0. Each of these axes is one channel."""
         return tuple(i for i, axis in enumerate(AXES[: self.axes]) if axis not in self.clamped)
 
     @property
@@ -206,9 +209,10 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def within(cls, device: Device, u: NDArray[np.float64]) -> Mechanics:
         """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
 
-        A negative entry of u selects the bound itself, because the worst devices lie near the bounds. From 0 to 1 a
-        parameter moves away from its bound on a logarithmic scale: the motor's mass to ten times the bound, the
-        stiffness to a tenth, the damping to its upper bound, the handle's mass (no bound) to a hundredth of its value.
+        A negative entry of u selects the bound itself, because the worst devices lie near the bounds. As an entry rises
+        from 0 to 1, its parameter moves away from the bound on a logarithmic scale: the motor's mass to ten times the
+        bound, the stiffness to a tenth, the damping to its upper bound. The handle's mass has no bound and moves to a
+        hundredth of its value.
         """
         known = device.guaranteed
         assert known is not None  # the caller draws only if every device has bounds
@@ -323,7 +327,7 @@ _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 
 
 @dataclass(frozen=True)
 class Listed:
-    """A real device along one axis; None stands for a number without a published source."""
+    """A real device along one axis. A field is None if no source publishes its number."""
 
     title: str
     kind: _Known | None = None  # kind of the model that the source identified; without it a scenario assumes "rigid"
@@ -337,7 +341,7 @@ class Listed:
 
     @property
     def known(self) -> dict[str, _Known]:
-        """The published fields of a RigidDevice. A published friction is an upper bound, hence `friction_max`."""
+        """The published values by the names of RigidDevice's fields. A published friction becomes `friction_max`."""
         fields = ("kind", "damping", "mass", "force_limit", "encoder_step")
         facts = {name: fact for name in fields if (fact := getattr(self, name))}
         return facts | ({"friction_max": self.friction} if self.friction else {})
@@ -388,7 +392,7 @@ CATALOGUE: Mapping[str, Listed] = {
     "hapkit": Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
-_NEEDED = ("damping", "force_limit")  # fields whose assumed defaults do not apply to a device of the catalogue
+_NEEDED = ("damping", "force_limit")  # the defaults of these fields do not apply to devices of the catalogue
 
 
 def listed_device(name: str) -> tuple[str, Listed]:

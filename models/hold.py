@@ -57,7 +57,10 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return matrices (..., m, entries) from [s; held forces; w; f] to a channel's position when its force latches."""
+    """Return the rows (..., m, entries) from [s; held forces; w; f] to each channel's position when its force latches.
+
+    s is the plant's state, w are the external forces, and f the new forces of the tick.
+    """
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -93,7 +96,7 @@ def expm_each(matrices: _Array) -> _Array:
     """Return the exponential of each of (nsim, n, n) matrices, by scaling and squaring.
 
     Each result depends on its own matrix only. scipy.linalg.expm calls a threaded BLAS for every matrix, which made
-    verdicts about many humans several times slower.
+    verdicts about many humans several times slower than this function does.
     """
     norm = np.abs(matrices).sum(axis=1).max(axis=1)
     halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
@@ -114,9 +117,9 @@ def expm_each(matrices: _Array) -> _Array:
 def _units(A: _Array, h: float) -> _Array:
     """Return units (nsim, states) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    The second half of the states are velocities, unless the plant has impedances. Their unit is a rate near that of the
-    fastest mode. For a stiff plant the norm of h A is then about this rate times h, and the exponential has a rounding
-    error of 1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
+    In a plant without impedances the second half of the states are velocities. The unit of a velocity is close to the
+    frequency of the fastest mode. The norm of h A for a stiff plant is then about this frequency times h, and the
+    exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))

@@ -95,9 +95,9 @@ class Port:
 
     The points are the handles (several if a person holds several devices), followed by the human's own masses. The
     base is ground, or a person's body if the port is an arm of this person. Row i of `across` holds the derivatives of
-    the length of spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers
-    for a lever. With several axes every point and the base have `axes` neighbouring columns of `across`. Arrays with a
-    leading axis hold many humans of the same structure.
+    the length of spring-damper i with respect to the positions of the points and the base: -1 and 1 between two points,
+    other numbers for a lever. With several axes every point and the base have `axes` neighbouring columns of `across`.
+    Arrays with a leading axis hold many humans of the same structure.
 
     Raises:
         ValueError: A shape does not match, a parameter is negative, a point other than a handle has no mass, `pull` is
@@ -154,7 +154,10 @@ class Port:
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
-        """Return the port on `axes` axes. A port with one axis is repeated. Raises ValueError for other numbers."""
+        """Return the port on `axes` axes. A port with one axis acts in the same way on every axis.
+
+        Raises ValueError if the port has several axes, but not `axes`.
+        """
         if self.axes == axes:
             return self
         if self.axes > 1:
@@ -350,7 +353,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         return force
 
 
-_MOST_LINKS = 500  # Largest number for one hand: its eigenvalues take 5 s; those of 1000 links take 30 s.
+_MOST_LINKS = 500  # of one hand: the eigenvalues of 500 links take 5 s, and those of 1000 links take 30 s
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
@@ -411,7 +414,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
 
 
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A hand without bodies: a transfer function from velocity to force, `mass` s + C (s I - A)^-1 B + D."""
+    """A hand that is given as a transfer function from velocity [m/s] to force [N]: `mass` s + C (s I - A)^-1 B + D."""
 
     A: tuple[tuple[float, ...], ...]
     B: tuple[tuple[float, ...], ...]

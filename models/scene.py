@@ -323,7 +323,10 @@ class _Placed(NamedTuple):
 def _placed(
     devices: Sequence[Device], ports: Sequence[Port], held: Sequence[tuple[tuple[int, ...], Port]]
 ) -> tuple[_Placed, ...]:
-    """Return the placed ports of all devices, then those of `held`. Raises ValueError as `build` does."""
+    """Return the placed ports of all devices, then those of `held`.
+
+    Raises ValueError if the numbers or axes of humans and devices differ, or if a person holds an impossible device.
+    """
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
     check_holds([holds for holds, _ in held], len(devices))
@@ -622,7 +625,8 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes if links have 1 + 2 max(axes)^2 numbers; () if three
+    # (devices,) numbers of free axes, if a link has 1 + 2 max(axes)^2 numbers; () if it has three
+    axes: tuple[int, ...] = ()
     mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:
@@ -673,10 +677,10 @@ MIXED = 0  # value of `links`: the humans of a set all have one link or all two,
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
     """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
-    The links do not depend on other indices. With `links` = MIXED all humans have one link, or all have two.
-    With `axes` a link has random amounts of damping and stiffness along `directions`. Each direction d has a weight w
-    such that w d d' sums to the identity. So the damping and the stiffness in any direction lie within the
-    population's ranges.
+    The links depend on this index only, not on the other indices that are drawn. With `links` = MIXED all humans have
+    one link, or all have two. With `axes` a link has random amounts of damping and stiffness along `directions`. Each
+    direction d has a weight w such that the sum of w d d' is the identity. So the damping and the stiffness in any
+    direction lie within the population's ranges.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     count = int(rng.integers(1, 3)) if links == MIXED else links
@@ -740,7 +744,7 @@ def _draw_bodies(population: Population, persons: int, seed: int, index: int) ->
 
 @dataclass(frozen=True, eq=False)
 class HumanSets:
-    """Sets of any humans, with the methods of Crowd. The sets differ in parameters only, and have the same persons."""
+    """Sets of any humans, with the methods of Crowd. All sets have one structure and the same persons."""
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, devices)
     people: tuple[Person, ...] = ()
@@ -803,7 +807,8 @@ class Variants:
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     """Return the models of the devices with every set of humans.
 
-    Raises ValueError as `build` does, or if humans of one device differ in their structure.
+    Raises ValueError if the numbers or axes of humans and devices differ, if a person holds an impossible device, or if
+    the humans of one device differ in their structure.
     """
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)

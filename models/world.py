@@ -105,7 +105,10 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 digest of the names and contents of a scene's files. Raises ValueError as `files_of` does."""
+    """Return the SHA-256 digest of the names and contents of a scene's files.
+
+    Raises ValueError for a file that cannot be read, is empty, too large or not XML, or is included twice.
+    """
     total = hashlib.sha256()
     for file in files_of(path):
         content = file.read_bytes()
@@ -121,7 +124,7 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 def touchable_bodies(path: Path) -> list[str]:
     """Return the names of the world's children that have no joint and are not mocap bodies, in file order.
 
-    All of them but welded bodies may be contacts. Raises ValueError for a file that MuJoCo refuses or cannot read.
+    Each of them may be a contact, unless it is welded. Raises ValueError for a file that MuJoCo refuses or cannot read.
     """
     return _without_joints(_spec(path))
 
@@ -504,9 +507,9 @@ class WorldPort:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Repeat the step until two in a row limit the same contacts with the same forces, up to _DIRECTION_SLACK.
+        """Repeat the step until two steps in a row limit the same contacts, with equal forces up to _DIRECTION_SLACK.
 
-        At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force acts, not the spring.
+        At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force replaces the spring's.
         """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)

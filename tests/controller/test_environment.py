@@ -126,7 +126,7 @@ def random_network(rng) -> Network:
 
 
 def test_stacked_networks_equal_single_ones():
-    """Stacked and sampled networks equal single ones, although one of the two has fewer states alone."""
+    """Stacked and sampled networks equal single ones, although one network alone has fewer states."""
     other = (Spring(("contact 1", "mass"), 90.0, 0.0), Spring(("mass", "contact 2"), 5e3, 7.0))
     networks = [FIGURE_4, Network(FIGURE_4.contacts, other, FIGURE_4.masses)]
     matrices = tuple(np.stack(parts) for parts in zip(*(network.matrices() for network in networks), strict=True))

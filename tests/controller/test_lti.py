@@ -41,7 +41,7 @@ def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
     """Eigenvectors and Schur forms are cached by A, and must not bring B, C or D of another block along."""
     G, other = blocks
     for H in (G, other, Lti(G.A, 2 * G.B, G.C[::-1], G.D, G.T), Lti(G.A.T, G.C.T, G.B.T, G.D.T, G.T)):
-        for z in (Z, 1.5 * Z):  # sums over poles, and substitution
+        for z in (Z, 1.5 * Z):  # responses on the circle are sums over poles, others come from substitution
             assert_close(H.at(z), [H.C @ np.linalg.solve(one * np.eye(H.order) - H.A, H.B) + H.D for one in z])
         np.testing.assert_allclose(np.sort_complex(H.poles()), np.sort_complex(np.linalg.eigvals(H.A)), atol=1e-12)
 

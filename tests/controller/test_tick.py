@@ -87,7 +87,7 @@ def test_many_simulations_equal_separate_runs():
         buffer.x[k] = x[k]
         buffer.tick(k)
     for i in range(5):
-        # the product's summation order may differ with the number of columns
+        # The number of columns may change the order in which a matrix product adds its terms.
         np.testing.assert_allclose(buffer.f[:20, :, i], drive(process(F), x[:, :, i]), rtol=1e-9, atol=1e-9)
 
 

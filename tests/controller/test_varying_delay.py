@@ -99,7 +99,7 @@ def test_each_pattern_draws_the_delays_it_names():
     np.testing.assert_allclose(counts[1:], ticks / 3, rtol=0, atol=4 * np.sqrt(ticks * 2 / 9))
     bursty = VaryingDelay((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
     starts = int((np.diff(bursty) == 1).sum())
-    # 1600 bursts and calm times have geometric lengths. Four deviations are 8 % of their number, 11 % of the share.
+    # Four standard deviations of the number of bursts are 8 % of it; those of the share of ticks in bursts are 11 %.
     assert starts == pytest.approx(ticks / 25, rel=0.1)
     assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
     recorded = VaryingDelay((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))

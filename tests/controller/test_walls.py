@@ -146,7 +146,7 @@ def test_a_touching_wall_is_a_spring_damper(coupling, psi):
     f = drive(walled(network, coupling, (1, 2), psi), x).f[:300]
     F = force_map(environment(held(network), T), coupling, (1, 2), psi)
     linear = drive(Process(Law(F), np.full(2, np.inf), np.zeros(2)), x).f[:300]
-    assert np.abs(f - linear).max() > 100  # the gaps' constant forces
+    assert np.abs(f - linear).max() > 100  # the gaps add constant forces
     change, expected = f[..., 0] - f[..., 1], linear[..., 0] - linear[..., 1]
     np.testing.assert_allclose(change, expected, rtol=0, atol=1e-9)  # the gaps make forces of up to 11 kN
 
