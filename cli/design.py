@@ -13,7 +13,7 @@ import msgspec
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.assessment import Assessment, assess
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.coverage import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     loop = _loop(args, scenario)
     begun = _begun_bound(args, loop)
     design = _design(args, loop)
-    assessment = _assessment(args, scenario, loop, design)
+    assessment = verdicts.assessment_of(args, scenario, design, loop)
     stored = store(loop, design, out, assessment)
     slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before the bound.
     if slow:
@@ -160,22 +160,6 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     further = _options_of(args, args.coupling)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
         return proved(loop, design_by_kind(loop, args.coupling, args.condition, progress, **further))
-
-
-def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
-    """Assess the design in its loop, with the proof and the search between vertices that the design made."""
-    from haptic_loop.sim.couplings import qualified
-
-    with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
-        assessment = assess(
-            loop,
-            design,
-            ranges_seed=args.seed,
-            limiter=args.limiter,
-            band_hz=args.band_hz or BAND_HZ,
-            progress=move,
-        )
-    return qualified(scenario, args.case, assessment)
 
 
 def _begun_bound(args: argparse.Namespace, loop: Loop) -> Forked[Bound] | None:

@@ -50,7 +50,7 @@ def main(argv: list[str]) -> int:
         _require_papers(args, simulated)
     chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
-    assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
+    assessment = assessment_of(args, scenario, chosen, environment=simulated.environment, energy_budget=budget)
     render.announce(args, verdicts.verdict(assessment))
     nearby = _nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment)
     from haptic_loop.sim.report import beside_the_paper, run_report

@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
+from typing import Any
 
 from haptic_loop.cli import render
-from haptic_loop.controller.environment import RIGID_WALL, Environment
-from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult
+from haptic_loop.controller.environment import RIGID_WALL
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult, assess
 from haptic_loop.design.coverage import Robustness
 from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
 from haptic_loop.design.transparency import BAND_HZ
-from haptic_loop.sim.couplings import assessed, choose
+from haptic_loop.sim.couplings import choose, qualified
 from haptic_loop.sim.scenario import Scenario
 
 
@@ -24,29 +26,18 @@ def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def assessment_of(
-    args: argparse.Namespace,
-    scenario: Scenario,
-    chosen: Chosen,
-    environment: Environment | None = None,
-    energy_budget: float | None = None,
+    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, loop: Loop | None = None, **runs: Any
 ) -> Assessment:
-    """Return the assessment of a coupling in the scenario's loop.
+    """Return the assessment of a coupling in `loop`, by default the scenario's loop.
 
-    `environment` replaces the scenario's environment in the run.
+    `runs` are `environment` and `energy_budget` of `assess`, if they differ from those of the loop.
     """
-    ranges = scenario.loop(args.case).ranges
-    with render.progress("searching the ranges" if ranges else "proving the conditions") as move:
-        return assessed(
-            scenario,
-            args.case,
-            chosen,
-            environment=environment,
-            energy_budget=energy_budget,
-            limiter=args.limiter,
-            seed=args.seed,
-            band_hz=getattr(args, "band_hz", None) or BAND_HZ,
-            progress=move,
-        )
+    loop = loop or scenario.loop(args.case)
+    with render.progress("searching the ranges" if loop.ranges else "proving the conditions") as move:
+        band_hz = getattr(args, "band_hz", None) or BAND_HZ
+        more = {"ranges_seed": args.seed, "limiter": args.limiter, "band_hz": band_hz, "progress": move}
+        assessment = assess(loop, chosen, **more, **runs)
+    return qualified(scenario, args.case, assessment)
 
 
 # ---- the verdict
