@@ -160,25 +160,15 @@ class Collected(Generic[Block]):
         self.places[name, place] = len(self.places)
         return len(self.places) - 1
 
-    def of(self, name: str) -> dict[int, int]:
-        """Return {channel or wall: number} of the inputs with this name."""
-        return {place: i for (known, place), i in self.places.items() if known == name}
-
-    def slip(self, channel: int) -> int:
-        """Return the number of the limiter's slip of a channel."""
-        return self.places["de", channel]
-
     def moving(self, channel: int) -> list[tuple[int, _Weights]]:
         """Return (input, weights w_0 + w_1 z + ..) of the displacement that a channel's force multiplies."""
-        parts: list[tuple[int, _Weights]] = [
-            (self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel
-        ]
-        return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
+        parts = [(self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel]
+        return parts + ([(self.places["de", channel], (1,))] if ("de", channel) in self.places else [])
 
-    def slipping(self, channel: int) -> tuple[int, int]:
+    def slipping(self, channel: int) -> list[int]:
         """Return the number of the displacement from which a channel's slip is subtracted, and that of the slip."""
-        (own,) = (self.places[i.name, channel] for i in self.hands if i.channel == channel and i.slips)
-        return own, self.slip(channel)
+        (own,) = (i for i in self.hands if i.channel == channel and i.slips)
+        return self._with_slip(own)
 
     @property
     def size(self) -> int:
@@ -233,9 +223,6 @@ class Collected(Generic[Block]):
         for i, j, weight in entries:
             out[i, j] = out[i, j] + weight
         return out
-
-    def gain(self) -> Any:
-        return self._matrix(self._gain)
 
     def _bank(self) -> Lti:
         """Return the block from sent forces (m,) to all weighted forces, with one delay line per channel."""
@@ -296,7 +283,7 @@ class Collected(Generic[Block]):
             place = follows + w + late.index(column)
             steps[row, place] = steps[row, place] + weight
         free = np.hstack([sums, steps]) @ vstack(regular, signals) + self._matrix(self._terms)
-        return times(sums, static), free, self.gain()
+        return times(sums, static), free, self._matrix(self._gain)
 
 
 def _of_weights(entries: Sequence[tuple[int, int, _Weights]], outputs: int, inputs: int, T: Number) -> Lti:
@@ -692,7 +679,7 @@ class Limited(Fact):
             for part in block.slipping(i):
                 block.keep(part, _SPARE * self.rho[d])
             c = [numbers(v, block.T) for v in values["c"][d * self.lags : (d + 1) * self.lags]]
-            e, rho = block.slip(i), numbers(self.rho[d], block.T)
+            e, rho = block.places["de", i], numbers(self.rho[d], block.T)
             block.force(e, i, (-rho, rho))
             block.steps(e, i, _less_advance(block.path[i], 1))
             for j, weight in enumerate(c, start=1):
@@ -749,7 +736,8 @@ def compose(
     for fact in facts:
         fact.enter(block, loop, values)
     S, free, gain = block.build(G)
-    m, ways = [block.places[i.name, i.channel] for i in block.hands if i.slips], list(block.of("u").values())
+    m = [block.places[i.name, i.channel] for i in block.hands if i.slips]
+    ways = [number for (name, _), number in block.places.items() if name == "u"]
     F1, Y1 = S[..., m, :][..., :, m], S[..., ways, :][..., :, ways]
     static, least = {"F(1)": F1}, ("F(1)",)
     if walls:
