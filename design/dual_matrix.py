@@ -106,8 +106,8 @@ class DualMatrix:
 
         In units of 2^-53, the error of a complex sum of n products is 3 (n + 6) times the sum of absolute values, with
         |Li2| <= 2. A value of Li2 has an error of 300, of which 160 come from the rounding of its argument near 2 pi.
-        The error of a bend is 8 times the adjacent slopes, that of a is 2, with |a| <= 2, and that of a power z^-k is 7
-        (k + 2). The error of an eigenvalue is 20 m times the norm.
+        The error of a bend is 8 times the adjacent slopes, that of a is 2, with |a| <= 2, and that of a power z^-k is
+        7 (k + 2). The error of an eigenvalue is 20 m times the norm.
         """
         m, bends, slopes = len(self.mean), np.abs(self.bends).sum(axis=0), self.slopes.sum(axis=0)
         steps = np.arange(len(self.sums))[:, None, None]
@@ -130,7 +130,7 @@ class DualMatrix:
         return g, hermitian(self.mean - (np.exp(-1j * w) - 1)[:, None, None] * g + polynomial)
 
     def _error(self, left: Array, right: Array, g_left: Complex, g_right: Complex) -> Array:
-        """Return a bound on the norm of D less its linear interpolant, interval by interval (k,)."""
+        """Return a bound of the norm of the difference between D and its linear interpolant in each interval, (k,)."""
         spend(_EVALUATION * left.size * self.points.size)
         m, length = len(self.mean), (right - left)[:, None, None]
         g = np.empty((left.size, m * m))

@@ -30,7 +30,7 @@ def named(option: str, text: str) -> Any:
 
     Raises:
         InputError: The text is not FILE.py:NAME with identifiers of Python for FILE and NAME; the file or the object
-            does not exist; the file is not valid Python or exits; or a loaded module of another origin has its name.
+            does not exist; the file is not valid Python or exits; or another loaded module has the file's name.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)
@@ -97,7 +97,7 @@ def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) ->
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Return whether a `raise` statement of this package raised the error, so that a traceback is of no use."""
+    """Return whether a `raise` statement of this package raised the error, which then needs no traceback."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return last.filename.startswith(_OURS) and (last.line or "").startswith("raise ")
 

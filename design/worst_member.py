@@ -78,7 +78,7 @@ def search(
     progress: Progress = lambda done, total: None,
     over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """Find the members of the regions at which `ratio` is largest.
+    """Return the members at which `ratio` is largest. A region consists of all members with the same present springs.
 
     The search ends early when its budget of counted work is spent, or when `over` returns True because the user's time
     limit has passed. The result then contains the maxima among the members that were tried.
