@@ -1,8 +1,7 @@
 """The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
-`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite. Their arguments are
-arrays or cvxpy expressions. The strict inequalities (2), (15), (17) and (18) of the paper have no solution;
-docs/theory.md says how the program avoids them.
+`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite. The strict inequalities
+(2), (15), (17) and (18) of the paper have no solution; docs/theory.md says how the program avoids them.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,37 +117,34 @@ def reachability_scaled(G: Lti) -> Array:
     return scipy.linalg.cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
 
 
-_Matrix = Any  # Array or cvxpy expression, (rows, columns)
-
-
 class Ports(NamedTuple):
     """The system x+ = A x + B u with two outputs, y2 = C2 x + D2 u at the port and y1 = C1 x + D1 u.
 
     The supply is y2'u - y1' Delta y1 - u' Phi u. Output strict passivity has y1 = y2.
     """
 
-    A: _Matrix
-    B: _Matrix
-    C2: _Matrix
-    D2: _Matrix
-    C1: _Matrix
-    D1: _Matrix
+    A: Array
+    B: Array
+    C2: Array
+    D2: Array
+    C1: Array
+    D1: Array
 
     @classmethod
     def same(cls, G: Lti) -> Ports:
         return cls(G.A, G.B, G.C, G.D, G.C, G.D)
 
 
-def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
+def lemma1(G: Ports, P: Array, Delta: Array, Phi: Array) -> Array:
     """Return the matrix of x'Px - x+'Px+ + supply in (x, u), the negative of (2). This matrix and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
     state = P - A.T @ P @ A - C1.T @ Delta @ C1
     port = (D2 + D2.T) / 2 - B.T @ P @ B - D1.T @ Delta @ D1 - Phi
-    return symmetric([[state, corner], [corner.T, port]])
+    return _symmetric([[state, corner], [corner.T, port]])
 
 
-def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
+def lemma2(G: Ports, Q: Array, Y: Array, Sigma: Array | None, Phi: Array) -> Array:
     """Return [[Y, R'], [R, S]] of Lemma 2. It is affine in A, B, C and D, so that these may be unknowns.
 
     With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is equivalent to (2). Sigma = None means Delta = 0.
@@ -164,10 +160,10 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
         for row, block in zip(rows, (C1.T, D1.T, np.zeros((n, C1.shape[0]))), strict=True):
             row.append(block)
         rows.append([C1, D1, np.zeros((C1.shape[0], n)), Sigma])
-    return symmetric(rows)
+    return _symmetric(rows)
 
 
-def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
+def lemma3(A: Array, B: Array, C: Array, D: Array, X: Array, U: Array, mu2: Array) -> Array:
     """Return the matrix of Lemma 3 and (24) with mu2 = mu^2.
 
     It is positive definite for some U > 0 and X = U^-1 if and only if ||G||_inf < mu.
@@ -179,18 +175,10 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
         [A, B, U, np.zeros((n, p))],
         [C, D, np.zeros((p, n)), np.eye(p)],
     ]
-    return symmetric(rows)
+    return _symmetric(rows)
 
 
-def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
-    """Return the block matrix of all blocks that are not empty, made exactly symmetric. Arrays give an array."""
-    blocks = [[block for block in row if 0 not in block.shape] for row in rows]
-    blocks = [row for row in blocks if row]
-    numbers = all(isinstance(block, np.ndarray) for row in blocks for block in row)
-    if numbers:
-        M = np.block(blocks)
-    else:
-        import cvxpy as cp  # loaded only for expressions
-
-        M = cp.bmat(blocks)
+def _symmetric(rows: list[list[Array]]) -> Array:
+    """Return the block matrix, made exactly symmetric."""
+    M = np.block(rows)
     return (M + M.T) / 2

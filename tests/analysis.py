@@ -14,7 +14,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Block
 from haptic_loop.controller.lti import Array, Lti, taps
 from haptic_loop.design.conditions import _regular_part
-from haptic_loop.design.lmi import Ports, lemma1, symmetric, unit_environment
+from haptic_loop.design.lmi import Ports, unit_environment
 
 
 def balanced(G: Lti) -> Lti:
@@ -66,6 +66,21 @@ def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
     H = V - theta_hat(theta)
     R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
     return Ports(H.A, H.B, R, H.dc() / 2, H.C, H.D)
+
+
+def symmetric(rows: list[list[cp.Expression]]) -> cp.Expression:
+    """Return the block matrix of all blocks that are not empty, made exactly symmetric."""
+    blocks = [[block for block in row if 0 not in block.shape] for row in rows]
+    M = cp.bmat([row for row in blocks if row])
+    return (M + M.T) / 2
+
+
+def dissipated(G: Ports, P: cp.Expression, Delta: cp.Expression, Phi: cp.Expression) -> cp.Expression:
+    """Return the matrix of x'Px - x+'Px+ + y2'u - y1'Delta y1 - u'Phi u in (x, u), for expressions."""
+    A, B, C2, D2, C1, D1 = G
+    corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
+    state, port = P - A.T @ P @ A - C1.T @ Delta @ C1, (D2 + D2.T) / 2 - B.T @ P @ B - D1.T @ Delta @ D1 - Phi
+    return symmetric([[state, corner], [corner.T, port]])
 
 
 def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
@@ -122,8 +137,8 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
     P_E, P_V = _storage(shortage.A), _storage(excess.A)
     zero = np.zeros((m, m))
     constraints = [
-        lemma1(Ports.same(shortage), P_E, zero, -Phi) >> 0,
-        lemma1(excess, P_V, Delta_V, -s * np.eye(m)) >> 0,
+        dissipated(Ports.same(shortage), P_E, zero, -Phi) >> 0,
+        dissipated(excess, P_V, Delta_V, -s * np.eye(m)) >> 0,
         lemma4(Delta_V, Phi) + s * np.eye(2 * m) >> 0,
         Delta_V + s * np.eye(m) >> 0,
         *(P >> 0 for P in (P_E, P_V) if isinstance(P, cp.Variable)),

@@ -29,7 +29,7 @@ MAY_IMPORT = {
 #: the only folders that may import a package
 ONLY_IN = {
     "mujoco": {"models", "sim"},
-    "cvxpy": {"design"},
+    "cvxpy": set(),
     "clarabel": {"design"},
     "serial": {"hw"},
     "matplotlib": {"sim", "cli"},
