@@ -589,35 +589,28 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
 
 # Stacks of couplings or environments, for the maps over K and B (sim.zwidth).
 
-_Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at z, one row for each system
+
+def stacked_scales(demand: Callable[[Complex], Demand[Sampled]], poles: Complex, longest: int) -> Array:
+    """Return the least s (n,) of n demands with these poles (n, p), whose loop has the `longest` delay [samples].
+
+    `demand` returns the responses at z (n, k), or at z (1, k) for all of them, with one row for each demand.
+    """
+
+    def needed(w: Array) -> Array:
+        sampled = demand(on_circle(w))
+        return _least_multiple(hermitian(sampled.free.G), hermitian(sampled.gain.G))
+
+    return suprema(needed, *frequencies_of_many(poles, longest))
 
 
-def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
+def this_environment_ratios(at: Callable[[Complex], Sampled], poles: Complex, loop: Loop) -> Array:
     """Return required over available damping (n,), or inf, of n force maps with these responses and poles (n, p)."""
     here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
     sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= _STATIC) & (least >= -_STATIC)
-
-    def needed(w: Array) -> Array:
-        return _least_scales(this_environment_demand(at(on_circle(w)), loop))
-
     longest = max(n + p for n, p in zip(loop.theta, loop.psi, strict=True))
-    return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, longest)), 0.0), np.inf)
-
-
-def any_environment_ratios(
-    V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
-) -> Array:
-    """Return required over available damping (count,) of any-environment; `V` samples the V of `count` couplings."""
-
-    def needed(w: Array) -> Array:
-        return _least_scales(demand(V(on_circle(w))))
-
-    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(loop.delays.hi)))
-
-
-def _least_scales(demand: Demand[Sampled]) -> Array:
-    return _least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G))
+    scales = stacked_scales(lambda z: this_environment_demand(at(z), loop), poles, longest)
+    return np.where(sound, np.maximum(scales, 0.0), np.inf)
 
 
 def _regular_part(E: Lti) -> Lti:

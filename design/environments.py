@@ -28,12 +28,12 @@ from haptic_loop.design.conditions import (
     any_environment,
     any_environment_demand,
     any_environment_per_channel,
-    any_environment_ratios,
     asymmetric,
     covers,
     delayed_environment_demand,
     least_scale,
     ratio_in,
+    stacked_scales,
     this_environment,
     this_environment_demand,
     this_environment_ratios,
@@ -702,8 +702,9 @@ class _AnyEnvironment(Multiplied):
         """Return required over available damping (n,); None as the multiplier means the first one of a search."""
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
         values = self.usual(None, loop) if multiplier is None else multiplier
-        return any_environment_ratios(
-            lambda z: coupling.sampled(z, loop.T), count, loop, lambda V: self.block(V, loop, values)
+        poles = np.zeros((count, 0), dtype=np.complex128)  # The grid resolves no poles of V.
+        return stacked_scales(
+            lambda z: self.block(coupling.sampled(z, loop.T), loop, values), poles, max(loop.delays.hi)
         )
 
     def _without(self, coupling: Coupling) -> str:
