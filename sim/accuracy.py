@@ -47,8 +47,9 @@ def position_error(
 ) -> PositionError:
     """Return the position error of a trace against the exact engine.
 
-    `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace that clips gets no
-    figures, because growth multiplies any difference; `reason` then has the error up to the first clipped tick.
+    `grows` says whether the loop is unstable; by default its eigenvalues decide. If an unstable trace has clipped
+    forces, there are no figures, because growth multiplies any difference; `reason` has the error before the first
+    clipped force.
     """
     if exact is None:
         return PositionError(reason="the loop has Coulomb friction, which the exact engine does not model")
@@ -90,7 +91,7 @@ class Row:
     integrator: str | None
     substeps: int | None
     position_relative_rms: float | None  # rms error of positions over the rms of the exact positions
-    growth_rate_error: float  # [1/s] the error with or without the coupling, whichever is larger in magnitude
+    growth_rate_error: float  # [1/s] of two errors, with and without the coupling, the one of larger magnitude
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of one channel's force in the limit cycle without coupling
     cycle_frequency_hz: float | None  # frequency of the same force
@@ -111,7 +112,7 @@ class _Reference:
 
 
 def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
-    """Run the exact engine on the coupled loop, and on the uncoupled one if that is unstable."""
+    """Return the exact engine's runs of the coupled loop and, if it is unstable, of the uncoupled loop."""
     cycle = None
     if unstable(exact_growth(uncoupled)):
         free = run(uncoupled, "exact")
@@ -124,9 +125,11 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
 def measure_all(
     coupled: Simulation, uncoupled: Simulation, default: int, progress: Callable[[int, int], None]
 ) -> tuple[list[Row], list[str], bool]:
-    """Return (rows of the settings that are stable on this plant, reasons for the others, whether Ctrl-C interrupted).
+    """Measure the settings of `_SETTINGS`, and RK4 with its default number of substeps `default`.
 
-    `default` is the default number of substeps of RK4.
+    Returns:
+        Rows of the settings that are stable on this plant, the reasons why the others are left out, and whether Ctrl-C
+        ended the measurement early.
     """
     rows: list[Row] = []
     skipped: list[str] = []
@@ -158,9 +161,10 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto` for rows with right verdicts and finite figures that no row of the same engine dominates.
+    """Return the rows with `pareto` set.
 
-    Engines do not compete with one another, because the exact engine exists for linear plants only.
+    A row is on the front if its verdicts are right, its figures are finite, and no row of the same engine is at least
+    as good in all figures and better in one. Each engine has its own front, because the exact one needs a linear plant.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -171,7 +175,10 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
 
 
 def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
-    """Return standard deviation [N] and frequency [Hz] of a force's tail; a parabola refines the spectral peak."""
+    """Return the standard deviation [N] and the frequency [Hz] of a force in the last _TAIL ticks.
+
+    A parabola through three lines of the spectrum gives the frequency of the peak between the lines.
+    """
     force = trace.f[-_TAIL:, channel]
     level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
     peak = int(np.clip(np.argmax(level[1:-1]) + 1, 1, level.size - 2))
@@ -188,7 +195,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
 
 
 def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
-    """Return the larger growth-rate error [1/s] of the coupled and uncoupled loop, and if both verdicts are right."""
+    """Return the larger error of the growth rates [1/s] with and without coupling, and if both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
         held = _measured_hold(simulation, engine, integrator, substeps)
@@ -225,21 +232,21 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """The time at which a run leaves the range of the devices' linear model; peak forces and speeds, and their limits.
+    """The time at which a run leaves the range of the devices' linear model, with peaks and the range's limits.
 
-    Each list has one entry per channel, but the peaks of a run without ticks are empty.
+    Each list has one entry per channel, but for a run without ticks the lists of peaks are empty.
     """
 
     until_s: float | None  # first time at which a transmission force or a motor speed exceeds its limit
-    transmission_force_n: list[float | None]  # None for a rigid device
-    motor_speed_m_per_s: list[float]
-    credible_force_n: list[float | None]
-    credible_speed_m_per_s: list[float]
+    transmission_force_n: list[float | None]  # peak force of the transmission; None for a rigid device
+    motor_speed_m_per_s: list[float]  # peak speed of the motor
+    credible_force_n: list[float | None]  # largest force for which the model is credible
+    credible_speed_m_per_s: list[float]  # largest speed for which the model is credible
     reason: str | None = off_table("if given", None)
 
 
 def credible(simulation: Simulation, trace: Trace) -> Credible:
-    """Check whether a run stays within the forces and speeds for which the devices' linear model is credible.
+    """Return whether a run stays within the forces and speeds for which the devices' linear model is credible.
 
     The limits are `Device.most_credible_force` and `Device.credible_speed`.
     """
@@ -305,9 +312,10 @@ class ForceError:
 
 
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
-    """Compare the run's forces before clipping with those of Lambda E for the measured displacements.
+    """Return the run's forces beside those of the ideal Lambda E for the measured displacements.
 
-    With switching delays, a limiter or a passivity layer, the forces that the devices received are compared instead.
+    Lambda delays by `lam` samples, and E is the environment. The run's forces are those before clipping. With switching
+    delays, a limiter or a passivity layer they are those that the devices received.
     """
     process = simulation.process
     if process.walls:
@@ -336,15 +344,15 @@ def _rms(values: Array) -> float:
 # ---- the cheapest engine and step for a given error
 #
 # The error is the relative rms error of the encoders' positions over the run. Without friction the reference is a run
-# with the exact engine. With friction, two runs of RK4 are compared, with n and with 2 n substeps, and n is doubled
-# until their difference is small enough. If every doubling multiplies the difference by q, the error of the finest run
-# is q/(1 - q) times the last difference; a method of first order has q = 1/2. Two runs may agree by chance, so q is the
-# larger ratio of the last two doublings. It is at least _EVEN, because friction makes the ratio jump.
+# with the exact engine. With friction the reference is a run of RK4. Two runs, with n and with 2 n substeps, are
+# compared, and n is doubled until their difference is small enough. If every doubling multiplies the difference by q,
+# the error of the finest run is q/(1 - q) times the last difference; a method of first order has q = 1/2. Two runs may
+# agree by chance. Therefore q is the larger of the last two ratios of successive differences, and at least _EVEN.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
 _MOST_EVALUATIONS = 6e7  # largest number of evaluations of the dynamics in a refinement; they take two minutes
-_EVEN = 0.6  # least q
+_EVEN = 0.6  # least q, because friction makes these ratios jump
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
 _FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three differences
 
@@ -372,13 +380,13 @@ class EngineChoice:
 def compare_engines(
     simulation: Simulation, error: float, ticks: int | None = None, progress: Progress = lambda done, ticks: None
 ) -> tuple[EngineChoice, ...]:
-    """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
+    """Run each setting that is stable on the scene's plant for `ticks` ticks; return the settings, the cheapest first.
 
     Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
     constant delays without the layer. Every run calls `progress`.
 
-    Raises InputError if `error` is not positive, if nothing moves, or if, with friction, 256 substeps or 60 million
-    evaluations of the dynamics do not suffice.
+    Raises InputError if `error` is not positive or if nothing moves. With friction it is also raised if the error would
+    need more than 256 substeps or 60 million evaluations of the dynamics.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -432,7 +440,7 @@ class CrossCheck:
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
-    """Repeat the run with RK4, or with the exponential integrator if RK4 ran, and compare both.
+    """Repeat the run with RK4, or with the exponential integrator if RK4 ran, and return how much both runs differ.
 
     RK4 uses no matrix of the other engines, except for impedances of hands. `simulation` is the loop that ran, with its
     passivity layer. Positions are compared up to the end of the shorter run.
@@ -458,9 +466,9 @@ def _refined(
     runs: dict[tuple[str, int], tuple[Array, float]],
     progress: Progress,
 ) -> tuple[Array, float]:
-    """Return (positions of a refined run by RK4, bound of its error), and store every run in `runs`.
+    """Return the positions of a refined run by RK4, and a bound of their error; store every run in `runs`.
 
-    Raises InputError if nothing moves, or if the allowed substeps and evaluations do not suffice.
+    Raises InputError if nothing moves, or if `error` needs more substeps or evaluations than are allowed.
     """
     finest, best, gaps = 1, math.inf, list[float]()
     runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
@@ -486,7 +494,7 @@ def _refined(
 
 
 def _missed(gaps: Sequence[float]) -> float:
-    """Bound the finest run's error by the differences of successive runs; inf for fewer than three differences."""
+    """Return a bound of the finest run's error from the differences of successive runs; inf for fewer than three."""
     *_, first, second, last = math.inf, math.inf, *gaps
     if not math.isfinite(first + second + last):
         return math.inf
@@ -526,14 +534,14 @@ def _apart(own: Array, truth: Array) -> float:
 # The default integrator and number of substeps of a plant, and the map of an engine over one period.
 #
 # Without friction the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
-# the continuous plant decide: a step h [s] must resolve the fastest weakly damped mode w [rad/s] (w h <= 0.2), and
-# follow the strongest damping a [1/s] (a h < 1). The number of steps is at least 4, and is doubled until the verdict is
-# that of the exact loop.
+# the continuous plant give the number of steps. A step of h [s] must resolve the fastest weakly damped mode of
+# frequency w [rad/s] (w h <= 0.2), and follow the mode of the largest decay rate a [1/s] (a h < 1). The number of steps
+# is at least 4. It is doubled until the simulated loop has the verdict of the exact loop.
 
 MOST = 10_000  # largest number of substeps
 _MODE_LOST = "it damps fast modes away"
-_NEUTRAL = 1e-6  # allowed excess of a spectral radius over 1; rounding splits a free plant's eigenvalues at 1 by 1e-8
-_UNIT = 1e-6  # size of basis states and inputs, below every actuator limit; any size serves, as the plant is linear
+_NEUTRAL = 1e-6  # allowed excess of a spectral radius over 1; rounding moves double eigenvalues at 1 by 1e-8
+_UNIT = 1e-6  # size of basis states and inputs; the plant is linear, and no force limit is smaller
 
 
 def settle(
@@ -558,13 +566,14 @@ def settle(
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
-    """Return 1 for the exponential integrator without friction, else a number of steps that resolves the plant.
+    """Return the default number of steps per period: 1 for the exponential integrator without friction.
 
-    Raises InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
+    For other integrators it resolves the plant's motions and gives the right verdict. Raises InputError if no number up
+    to 10000 suffices, or for MuJoCo's integrator `discrete`.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return least_substeps(EXPONENTIAL)
-    if integrator == "discrete":  # `_agrees` measures a map of position and velocity; this integrator has more state.
+    if integrator == "discrete":  # It has more states than the positions and velocities of `_agrees`.
         raise InputError(f"--integrator discrete gives no reliable verdict: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
@@ -579,7 +588,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
 
 
 def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
-    """Return remarks on the user's number of substeps. Raises InputError outside the stable region."""
+    """Return remarks on the user's number of substeps. Raises InputError if the integrator is unstable with it."""
     if integrator == EXPONENTIAL:
         nearer = "with friction its error is of first order; RK4 is more accurate at equal cost (see --cross-check)."
         rubs = default_integrator(simulation.scene) != EXPONENTIAL
@@ -602,7 +611,7 @@ def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> l
 
 
 def _step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:
-    """Return the spectral radius of one substep on the passive plant; above 1 the integrator is unstable."""
+    """Return the spectral radius of one substep of the plant, which is passive: above 1 the integrator is unstable."""
     step = _measured_hold(simulation, "mujoco", integrator, 1, simulation.scenario.T / substeps)
     return float(np.abs(np.linalg.eigvals(step.A)).max()) if np.isfinite(step.A).all() else np.inf
 
@@ -627,9 +636,9 @@ def _measured_hold(
     substeps: int | None = None,
     T: float | None = None,
 ) -> HeldPlant:
-    """Return the map s[k+1] = A s[k] + B [w; f][k] of an engine, by stepping every basis state and input once.
+    """Return an engine's map s[k+1] = A s[k] + B [w; f][k] over T [s] (default: the scenario's period).
 
-    The default of `T` [s] is the scenario's period.
+    The engine makes one step from each basis state and with each input alone.
     """
     period, simulation = simulation.scenario.T if T is None else T, simulation.even
     stepped = make_engine(simulation, engine, integrator, substeps, period)
@@ -649,7 +658,7 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """Return the growth rate [1/s] of an engine's loop; with walls, the largest over all sets of touching walls.
+    """Return the growth rate [1/s] of the loop with an engine's map; with walls, the largest for any touched walls.
 
     Raises InputError if a tick of the engine gives numbers that are not finite.
     """

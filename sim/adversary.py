@@ -1,14 +1,14 @@
 """Seeded searches for the passive humans whose loop grows fastest: lossless chains, or hands of the population.
 
 A lossless chain of masses and springs dissipates no energy, and can present any reactance at the frequency where the
-loop is weakest. Masses and stiffnesses are bounded, so that no mode of a human exceeds about 3 kHz; above it, errors of
-the matrix exponential would decide the verdict.
+loop is weakest. The bounds on masses and stiffnesses keep the modes of a human below about 3 kHz. With faster modes,
+errors of the matrix exponential would decide the verdict.
 
 All conditions but the known-device ones assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact
 it dissipates the integral of v^2. For a sinusoid of frequency f, |dx|^2 / T is (sin a / a)^2 times the integral, with
-a = pi f T. At the frequency f where a condition binds, the share 1 - (sin a / a)^2 of the damping that it requires is
-therefore not needed: 4.7 % at 101 Hz and T = 1.2 ms. If no more than this share is missing, no search has found an
-unstable human.
+a = pi f T. At the frequency f where a condition binds, the share 1 - (sin a / a)^2 of the required damping is therefore
+not needed: 4.7 % at 101 Hz and T = 1.2 ms. No search has found an unstable human for a loop that lacks at most this
+share of the required damping.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; roundin
 
 
 class _Pass(NamedTuple):
-    """Settings of a search. Slow modes of lossless hands barely decay, and would hide faster ones that nearly grow."""
+    """Settings of a search. Slow modes of lossless hands barely decay, and could hide faster ones that nearly grow."""
 
     links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
     min_frequency_hz: float  # modes below it are ignored
@@ -73,9 +73,9 @@ def search(
     first: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """Search for the lossless humans with the largest growth; with `first`, stop once humans destabilise the loop.
+    """Search for the lossless humans with the largest growth, and return them.
 
-    `progress` is called after every generation.
+    With `first`, the search ends once humans destabilise the loop. `progress` is called after every generation.
     """
     from scipy.optimize import differential_evolution  # slow to load
 
@@ -125,10 +125,10 @@ def search_population(
     generations: int = 150,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """Search for the worst sets of hands that the scenario's population can draw.
+    """Search for the worst set of hands that the scenario's population can draw, and return it.
 
-    In the first generation all sets are new draws, later half of them. The others take each device's hand from one of
-    the worst sets so far, or from a new draw.
+    In the first generation all sets are new draws. In later generations half of the sets are new draws; the other sets
+    take each device's hand from one of the worst sets so far, or from a new draw.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []
@@ -144,7 +144,7 @@ def search_population(
 
 
 def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
-    """Return (growth [1/s], set) for each set: of all modes if one grows, otherwise of the modes from 2 Hz up."""
+    """Return (growth [1/s], set) for each set. If no mode grows, only modes from 2 Hz up count for the growth."""
     layouts: dict[object, list[tuple[Hand, ...]]] = {}
     for hands in sets:
         layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)
@@ -157,7 +157,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 def _lossless_humans(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
-    """Convert logarithms of masses and stiffnesses, (2 * devices * links, nsim), to lossless humans.
+    """Return lossless humans for logarithms of their masses and stiffnesses, (2 * devices * links, nsim).
 
     If one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. If all
     devices have guaranteed bounds, the last rows, _WITHIN per device, are the arguments u of `Mechanics.within`.

@@ -56,10 +56,10 @@ _SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 class ScenarioRun:
     """The run of a scenario, with its settings."""
 
-    simulation: Simulation  # the loop without a net (passivity layer)
-    ran: Simulation  # the loop that ran: `simulation`, with its net if there is one
+    simulation: Simulation  # the loop without a passivity layer
+    ran: Simulation  # the loop that ran: `simulation` with its passivity layer, if there is one
     period: Period | None  # the worst switching of the delays; None unless the pattern of the delays is adversarial
-    choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
+    choices: tuple[EngineChoice, ...]  # the settings that `settings.error` compared, the cheapest first; otherwise ()
     settings: EngineSettings  # engine, integrator and steps, with defaults filled in
     remarks: list[str]  # remarks on integrator and substeps
     trace: Trace
@@ -86,8 +86,8 @@ def run_scenario(
 ) -> ScenarioRun:
     """Run the closed loop for the scenario's duration, as `sim.run` and `simulate` do.
 
-    `lag` is rho (m,) [N/m] of the limiter of the forces, or None to clip them. `net` acts between controller and
-    devices. Raises InputError for impossible settings.
+    `lag` is rho (m,) [N/m] of the limiter of the forces, or None to clip them. `net` is the passivity layer between
+    controller and devices, or None. Raises InputError for impossible settings.
     """
     simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
@@ -138,12 +138,12 @@ def simulate(
         substeps: Steps per period. None means the default (sim.accuracy.default_substeps).
         seed: Seed of varying delays, periods and latencies.
         environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
-            [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes the
-            function passive up to the energy `energy_budget`.
-        energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the shell's (default 0, in a scene START_J).
-            Otherwise it is the energy budget of the devices; None means that they have no budget.
-        limiter: False to clip forces. By default a limiter limits them, if the coupling's guarantee covers a limiter
-            (`meta["assessment"]["force_limits"]`).
+            [m] that its port would have without a force, and returns the forces to feed back, (m,) [N]. An energy shell
+            makes the function passive up to the energy `energy_budget`.
+        energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the energy that the shell may give (default 0,
+            in a scene START_J). Otherwise it is the energy budget of the devices; None means that they have no budget.
+        limiter: False to clip forces. If True, a limiter acts where the coupling's guarantee covers a limiter, and
+            forces are clipped otherwise (`meta["assessment"]["force_limits"]`).
 
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
@@ -153,7 +153,8 @@ def simulate(
         none, and `meta["energy_budget"]` how often forces were limited (None without budget and shell).
 
     Raises:
-        ValueError: An engine, integrator or number of substeps is impossible (InputError if the scenario is at fault).
+        ValueError: The engine, the integrator or the number of substeps is impossible, or the scenario does not permit
+            a setting (InputError).
         TypeError: An argument has the wrong type.
         SingularLoop: The algebraic loop of environment and coupling has no solution.
     """
@@ -212,7 +213,7 @@ def simulate(
 def _net(
     environment: Callable[[Array], Array] | None, energy_budget: float | None, assessment: Assessment, world: bool
 ) -> Wanted | None:
-    """Return the shell of a MuJoCo scene or of a function, or the devices' energy budget, or None without any."""
+    """Return the passivity layer: the shell of a MuJoCo scene or of a function, the devices' budget, or None."""
     if world:
         from haptic_loop.sim.world import Touched  # Other scenarios start without these modules.
 
@@ -235,17 +236,17 @@ def validate(
     limiter: bool = True,
     traces: str = "sampled",
 ) -> crowds.Findings:
-    """Let `humans` sets of random passive humans, one human per device, hold the devices without voluntary motion.
+    """Judge the loop with random passive humans who hold the devices without voluntary motion, one per device.
 
     Args:
-        scenario: The loop. With walls the verdict is that of the set of touching walls with which it grows fastest.
+        scenario: The loop. With walls, the verdict is for the set of touched walls with which the loop grows fastest.
         coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
-        humans: Number of sets, drawn from `scenario.population`; set i depends on `seed` and i alone.
+        humans: Number of sets of humans, drawn from `scenario.population`. Set i depends only on `seed` and i.
         seed: Seed of the draws.
-        engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
-            engine and makes one engine for each set of humans.
-        duration: Length [s] of the traces; 0 means no traces, only eigenvalues over one period (and, under varying
-            delays or ticks, `Findings.switching`).
+        engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine). Your class makes one engine for
+            each set of humans, and its results are compared with those of the exact engine.
+        duration: Length [s] of the traces. With 0 there are no traces, but eigenvalues over one period and, under
+            varying delays or ticks, `Findings.switching`.
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.
@@ -257,7 +258,7 @@ def validate(
         loop unstable; `disagreements` (n,) says whether the engines disagree. crowds.Findings lists the other fields.
 
     Raises:
-        InputError: A device has Coulomb friction, or the environment is a MuJoCo scene; verdicts are of linear loops.
+        InputError: A device has Coulomb friction, or the environment is a MuJoCo scene. Verdicts need linear loops.
         ValueError: A number is out of range.
         TypeError: An argument has the wrong type.
     """

@@ -41,14 +41,16 @@ def choose(
     limiter: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Chosen:
-    """Return the coupling `name` of a case; by default design a spring-damper, or a moving average in a MuJoCo scene.
+    """Return the coupling `name` for a case.
 
     Args:
         scenario: The scenario whose loop the coupling is for.
         case: The reference delays, "I" or "II"; "none" for the loop without a coupling.
-        name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
+        name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function. None means a design: a moving average
+            in a MuJoCo scene, otherwise a spring-damper.
         condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
-        limiter: For kinds with proofs for limited forces: True requires such a proof, False ignores the limits.
+        limiter: True requires a proof for limited forces, False ignores force limits, and None is the kind's default.
+            Kinds without such proofs ignore it.
         progress: Called during long searches with (task, steps done, number of steps).
 
     Raises:
@@ -61,7 +63,7 @@ def choose(
     except (DesignFailed, InputError):
         raise
     except ValueError as error:
-        if place_of(error):  # The user's own class raised the error.
+        if place_of(error):  # A class in the user's own file raised the error.
             raise
         raise InputError(str(error)) from None
     return replace(chosen, own=own)
@@ -116,7 +118,7 @@ def own_of(name: str, loop: Loop) -> Chosen:
 
 
 def given(coupling: Any, kind: str = "given") -> Chosen:
-    """Return the record of a coupling, or of a design with its proofs; None means no coupling."""
+    """Return the choice of a coupling or of a design with its proofs. None means the loop without a coupling."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, limiter=proof)
@@ -167,7 +169,7 @@ def from_file(
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "varying_delay", "lam")  # The code below compares theta and varying_delay; lam affects no proof.
+    delays = ("theta", "varying_delay", "lam")  # theta and varying_delay are compared below; lam affects no proof.
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = claim is not None and not reason
     switching = stored.loop.varying_delay if proved and not differ else None
@@ -213,7 +215,7 @@ def assessed(
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
 ) -> Assessment:
-    """Assess the chosen coupling in the loop of a scenario before it runs.
+    """Return the assessment of the chosen coupling in the loop of a scenario, before the loop runs.
 
     Args:
         scenario: The scenario. A guarantee must cover all its ranges, delays, periods and force limits.
@@ -223,7 +225,7 @@ def assessed(
         energy_budget: W0 [J] of the shell around a function or a MuJoCo scene, otherwise of the devices' energy budget.
         limiter: False to clip forces.
         seed: Seed of the environments that are drawn from inside ranges.
-        band_hz: Frequency band [Hz] of the mismatch.
+        band_hz: Frequency band [Hz] over which the transparency error counts.
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
@@ -262,9 +264,9 @@ def qualified(scenario: Scenario, case: str, assessment: Assessment) -> Assessme
 def encoder_steps(
     scenario: Scenario, case: str, assessment: Assessment, steps: Sequence[float] | None = None
 ) -> EncoderSteps | None:
-    """Compare the devices' friction with that needed for encoder steps in the environment that runs.
+    """Return the devices' friction beside the friction that encoder steps need in the environment that runs.
 
-    `steps` (m,) [m] replace the scenario's encoder steps. Returns None without steps, or for a singular loop.
+    `steps` (m,) [m] replace the scenario's encoder steps. Returns None without steps, or if the loop is singular.
     """
     stated = assessment.guarantee
     beyond = stated.condition if stated and (stated.own or stated.condition in KNOWN_CONDITIONS) else None
@@ -280,6 +282,6 @@ def encoder_steps(
 
 
 def _shared(scenario: Scenario) -> list[float]:
-    """Return the divisor of each channel's friction: sqrt(n) if one number is the friction of n axes together."""
+    """Return a divisor for each channel's friction: sqrt(n) if one number bounds the friction of n axes together."""
     counts = [1 if isinstance(d.friction, tuple) else len(d.free) for d in scenario.device]
     return [count**0.5 for d, count in zip(scenario.device, counts, strict=True) for _ in d.free]

@@ -1,10 +1,12 @@
-"""Validate a loop with many random passive humans, by two engines, in batches over processes.
+"""Validate a loop with many random passive humans, by two engines, in batches that several processes may share.
 
-The humans of set i depend on the scenario, the seed and the number of links, not on other sets. Batches do not depend
-on the number of processes, so the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes
-from the map of its RK4 integrator over one period (its period map), which shares only the model with the exact engine.
-MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4.
-The exact engine simulates all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`).
+A set has one human for each device. The humans of set i depend on the scenario, the seed and the number of links, and
+not on other sets. The batches do not depend on the number of processes, so that any number gives the same bits.
+
+The first engine is the exact one, which simulates all sets. The second engine is MuJoCo or a user's own, and simulates
+all sets or a sample (`_witnessed`). MuJoCo's verdict comes from the map of its RK4 integrator over one period, the
+period map. Both engines share the model, but the period map uses no other result of the exact engine. MuJoCo's traces
+use the exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ _AT_RANDOM = 64  # number of sets in the random sample of all sets
 
 
 def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
-    """Draw humans of a user's population; yield (indices, sets of hands) for each group of equal structure."""
+    """Draw humans of a user's population; yield (indices, sets of hands) for each group with ports of equal shape."""
     drawn, layouts = {}, {}
     for i in indices:
         rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
@@ -87,7 +89,7 @@ class Validation:
     engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
     duration: float  # [s] length of the traces; 0 for no traces
     threads: int = 0  # number of MuJoCo's threads; 0: one, or one per core for large batches
-    environments: tuple[Member, ...] = ()  # the sets touch these in turn; if empty, all touch the scenario's
+    environments: tuple[Member, ...] = ()  # environments that the sets touch in turn; (): all touch the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 
@@ -101,7 +103,7 @@ class Validation:
         return assemble(self.scenario, self.coupling, self.lag)
 
     def batches(self) -> list[range]:
-        """Return all indices in batches of at most _BATCH; a batch has one environment."""
+        """Return the indices of all sets in batches of at most _BATCH. The sets of a batch touch one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
         return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
@@ -111,9 +113,10 @@ class Validation:
         return self.environments[index % len(self.environments)] if self.environments else None
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
-        """Draw the humans of these indices, and persons who hold the same devices as the scenario's persons.
+        """Draw the humans of these indices, and yield them in groups (indices, humans).
 
-        A user's own population draws from the same seeds; the scenario's persons are then used unchanged.
+        Persons who hold several devices are drawn for the same devices as the scenario's persons. A user's own
+        population draws no persons, so that the scenario's persons stay unchanged.
         """
         scenario = self.scenario
         if not isinstance(scenario.population, Population):
@@ -128,7 +131,7 @@ class Validation:
         return crowd
 
     def can_store(self, index: int) -> bool:
-        """Return whether a file can store the humans with this index; it stores only hands of the class Human."""
+        """Return whether a file can store the humans with this index: all must be of the class Human."""
         return all(isinstance(human, Human) for human in self.crowd(index).humans(0))
 
 
@@ -140,26 +143,28 @@ class Findings:
     the least dissipation of the devices, up to tick N.
 
     Attributes:
-        index: (n,) number of each set; in one validation, it determines the set.
+        index: (n,) number of each set. With the seed, it determines the humans of the set.
         radius: (n,) spectral radius of the exact loop, no unit.
-        exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
+        exact: (n,) growth rate of the exact loop [1/s]; a set with a positive rate makes the loop unstable.
         frequency: (n,) frequency of the exact loop's dominant mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
-        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's engine, or on the exact trace; nan with walls.
-        witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
-        trace_error: (n,) error of `trace` [1/s]; a rate of smaller size gives no verdict.
-        clipped: (n,) number of ticks with a force at its limit, or with an active limiter, on that trace.
-        energy: (n,) least energy W(N) on the exact trace [J]; without a limiter up to the first clipped tick.
+        trace: (n,) growth rate [1/s] on a trace: of the second engine if it simulated the set, otherwise of the exact
+            engine; nan with walls.
+        witnessed: (n,) whether the second engine, MuJoCo or a user's own, made the trace of `trace`.
+        trace_error: (n,) error of `trace` [1/s]; a rate that is smaller than its error gives no verdict.
+        clipped: (n,) number of ticks of the same trace in which a force is at its limit or a limiter acts.
+        energy: (n,) least energy W(N) [J] on the exact trace; without a limiter, before the first clipped force.
         audited: (n,) sum of the magnitudes of the terms of W [J].
         settling: (n,) ratio of the handles' rms speeds in the last and the second quarter of the exact trace.
         contacts: (n,) number of times that a wall was touched on the exact trace.
         mass: (n,) geometric mean over devices of a hand's total mass [kg].
         damping: (n,) geometric mean over devices of a hand's least damping [N s/m].
         switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
-        switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace for `switching`; nan also if the trace was clipped.
+        switching_mujoco: (n,) growth rate [1/s] of the second engine under the same delays or ticks; nan also if a
+            force of its trace is clipped.
         simulated: The duration of all traces together [s].
         interrupted: Whether the keyboard interrupted the validation.
-        lost: The reason why batches are missing although nobody interrupted, or "".
+        lost: The reason why batches are missing although the keyboard did not interrupt, or "".
     """
 
     index: NDArray[np.intp]
@@ -189,7 +194,7 @@ class Findings:
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
-        """(n,) whether the other engine contradicts the exact one: by its map, a deciding trace or `switching`."""
+        """(n,) whether the engines contradict each other: by `mujoco`, by `trace` if it decides, or by `switching`."""
         switching = disagree(self.switching, self.switching_mujoco)
         trace = np.where(self.trace_decides, self.trace, np.nan)
         return disagree(self.exact, self.mujoco) | disagree(self.exact, trace) | switching
@@ -221,7 +226,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
-    """Judge and simulate the humans of one batch; `ticked` is called with the other engine's ticks in each block."""
+    """Return the findings of one batch; `ticked` is called with the number of ticks in each block of a simulation."""
     simulation = validation.simulation
     if member := validation.environment(indices[0]):
         scenario = validation.scenario.replace(environment=member.network, ranges=None)
@@ -236,7 +241,7 @@ def _group(
     crowd: Crowd | HumanSets,
     ticked: Callable[[int], None],
 ) -> Findings:
-    """Judge and simulate humans whose ports have the same structure."""
+    """Return the findings for humans whose ports have equal shapes."""
     scenario, missing = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
     late = scenario.usual_latency
@@ -279,7 +284,7 @@ def _group(
     )
 
 
-#: (positions of the simulated sets in their group, integrator, timing) -> the other engine
+#: (positions in their group of the sets to simulate, integrator, timing) -> the second engine
 _Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
 
 
@@ -290,10 +295,10 @@ def _other_engine(
     crowd: Crowd | HumanSets,
     frozen: Collection[Lti],
 ) -> tuple[_Other | None, Array | None]:
-    """Return a factory of the other engine and the growth rates of its period maps; (None, None) without other engine.
+    """Return a factory of the second engine and the growth rates of its period maps; (None, None) without one.
 
-    `frozen` has the force map for each set of touching walls. A user's own engine gives its map by one step from each
-    basis state.
+    `frozen` has the force map for each set of touched walls. The map of a user's own engine is measured by one step
+    from each basis state.
     """
     if not isinstance(validation.engine, str):
         drawn = crowd.mechanics or ((),) * len(crowd)
@@ -314,7 +319,7 @@ def _other_engine(
 
 
 def _dominant(plants: HeldPlant, frozen: Iterable[Lti]) -> Mode:
-    """Return the dominant mode of each plant with the force map with which it grows fastest."""
+    """Return the dominant mode of each plant, with that force map of `frozen` with which the plant grows fastest."""
     return Mode.worst([dominant_mode(close(plants, F)) for F in frozen])
 
 
@@ -333,10 +338,10 @@ def _geometric_mean(values: Array) -> Array:
 def _witnessed(
     validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return the positions in a group of the sets that the other engine also simulates.
+    """Return the positions in a group of the sets that the second engine also simulates.
 
-    These are all sets with a lossless hand, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of
-    the random sample; with `all_traces`, all sets.
+    These are all sets with a lossless hand, the _NEAREST sets whose `growth` [1/s] is nearest to zero, and the sets of
+    the random sample. With `all_traces` these are all sets.
     """
     if validation.all_traces:
         return np.arange(len(index))
@@ -357,9 +362,9 @@ def _traced(
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
 ) -> ImpulseTest:
-    """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are those of `other`.
+    """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are the second engine's.
 
-    Periods are constant, and forces latch in the middle of their range; `switched_crowd` varies both.
+    Periods are constant here, and forces latch in the middle of their range. `switched_crowd` varies both.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks
@@ -382,7 +387,10 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine all batches in `shards` processes; after Ctrl-C, a worker's death or lack of memory, return a part."""
+    """Return the findings of all batches, examined in `shards` processes.
+
+    After Ctrl-C, the death of a worker, or a lack of memory, return the findings of the finished batches.
+    """
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:

@@ -1,25 +1,25 @@
 """Engines advance the plant from one sample to the next, for one simulation or for many at once.
 
-The plant has the state s = [positions q; velocities v; states of the hands' impedances], external forces w and forces f
-that are fed back. A step lasts h seconds.
+The plant consists of devices and hands. Its state is s = [positions q; velocities v; states of the hands' impedances].
+Its inputs are the external forces w and the forces f that the controller feeds back. A step lasts h seconds.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
     exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: MuJoCo computes the accelerations qacc
-                  (one mj_forward per step), J is the plant's matrix, and models.hold defines phi1; exact for linear
-                  scenes at any stiffness and h
+                  (one mj_forward per step), J is the plant's matrix, and models.hold defines phi1. This step is exact
+                  for linear scenes at any stiffness and h.
     RK4, ..       MuJoCo's own integrators; sim.accuracy compares numbers of steps per period
 
-The exponential and the exact engine use the same J, read from the compiled model. Comparing them checks the plant's
-matrices against MuJoCo's forces, but neither the model's parameters nor the time stepping. A comparison with RK4 checks
-the time stepping.
+The exponential and the exact engine use the same J, which is read from the compiled model. A comparison of both engines
+checks the plant's matrices against MuJoCo's forces, but checks neither the model's parameters nor the time stepping. A
+comparison with RK4 checks the time stepping.
 
 MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step includes the impedance and stays exact.
 MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the positions
 are fixed (Strang splitting). The splitting is of second order in the step and generates no energy.
 
 All engines read their inputs from a row of a step buffer and write the next row. With a timing (controller.delay)
-every tick has its own length and latch times. If forces latch late, the last entries of the plant's state are the
-forces that the actuators hold.
+every tick has its own length and latch times. A force latches when the actuator begins to apply it. If forces latch
+later than the tick begins, the plant's state ends with the forces that the actuators still hold.
 """
 
 from __future__ import annotations
@@ -51,8 +51,10 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = 256  # largest number of held plants, and of (period, latch times), that an engine caches
-_CALLS_FOR_THREADS = 128  # a batch with fewer calls of mj_forward in a tick uses one thread, which is then cheaper
+_MOST_MAPS = (
+    256  # size of two caches of an engine: the plants held over a period, and the products for (period, latch times)
+)
+_CALLS_FOR_THREADS = 128  # A batch with fewer calls of mj_forward in a tick is faster in one thread.
 
 
 class Engine(Protocol):
@@ -64,11 +66,11 @@ class Engine(Protocol):
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """A function of k that holds the plant input of row k for tick k and writes the plant state of row k + 1."""
+        """A function of k. It holds the inputs in row k of the buffer for tick k, and writes the state to row k + 1."""
         ...
 
     def troubled(self) -> bool:
-        """Return whether the engine has reported numerical trouble after which it cannot go on."""
+        """Return whether numerical trouble prevents the engine from going on."""
         ...
 
 
@@ -76,7 +78,7 @@ class Engine(Protocol):
 class RunsBlocks(Protocol):
     """Optional members of an engine that runs many ticks of a linear law in one call."""
 
-    run_block: RunBlock | None  # set by `start`; runs the law and `advance` for a number of ticks from row 0 on
+    run_block: RunBlock | None  # set by `start`; closes the loop for a number of ticks from row 0 on
 
     def back(self, k: int) -> None:
         """Restore the plant state of row k after a `run_block`."""
@@ -94,7 +96,7 @@ class _Exact:
 
 
 class ExactEngine(_Exact):
-    """An engine with one matrix product per period, for one plant or a stack (plant j moves simulation j)."""
+    """An engine with one matrix product per period, for one plant or a stack of plants, one for each simulation."""
 
     def __init__(self, plant: HeldPlant) -> None:
         self._plant = np.concatenate([plant.A, plant.B], axis=-1)
@@ -150,7 +152,7 @@ class OneByOne:
 
 
 class ExactTimedEngine(_Exact):
-    """The exact engine with the tick lengths and latch times of a timing; plant j of a stack moves simulation j."""
+    """The exact engine with the tick lengths and latch times of a timing, for one plant or a stack of plants."""
 
     def __init__(self, plant: Plant, timing: Timing) -> None:
         held, kinds = lru_cache(_MOST_MAPS)(partial(hold, plant)), timing.kinds
@@ -175,7 +177,7 @@ class ExactTimedEngine(_Exact):
 
 EXPONENTIAL = "exponential"  # this program's integrator, which reads MuJoCo's accelerations
 
-#: name -> integrator of MuJoCo's model; "exponential" never calls MuJoCo's integrator
+#: name -> integrator that is set in MuJoCo's model, although "exponential" never calls it
 INTEGRATORS = {
     EXPONENTIAL: "mjINT_RK4",
     "RK4": "mjINT_RK4",
@@ -189,7 +191,7 @@ _RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad], and largest decay (rate 
 
 
 def least_substeps(integrator: str) -> int:
-    """Return the least default number of steps per period."""
+    """Return the default number of steps per period if the plant needs no smaller steps."""
     return 1 if integrator == EXPONENTIAL else 4
 
 
@@ -199,13 +201,16 @@ def evaluations(integrator: str) -> int:
 
 
 def default_integrator(scene: Scene) -> str:
-    """Return "exponential" without friction, else "RK4", which with friction has the smaller error at equal cost."""
+    """Return "exponential" for a scene without friction, otherwise "RK4", whose error is then smaller at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
     return "RK4" if rubs else EXPONENTIAL
 
 
 def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
-    """Split a tick at its latch times into (seconds, mask (m,) or (0,) of channels whose previous force still acts)."""
+    """Return the parts of a tick between latch times: (seconds, mask of channels whose previous force still acts).
+
+    The mask is (m,), or (0,) if all forces latch at the beginning of the tick.
+    """
     taus = np.array(late or ())
     ends = np.unique(np.concatenate([[0.0], taus, [T]]))
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
@@ -216,7 +221,7 @@ class _Access:
     """Arrays and functions of MuJoCo that a tick reads, writes and calls.
 
     Arrays are (n,) for one simulation and (n, nsim) for many. `ticks` returns closures, because attribute lookups would
-    take longer than the step. They must not refer to the engine: the cycle would keep a batch's memory allocated.
+    take longer than the step. The closures must not refer to the engine: this cycle would keep its memory allocated.
     """
 
     T: float  # [s]
@@ -228,8 +233,8 @@ class _Access:
     forward: Callable[[], object]
     step: Callable[[int], object]  # makes a number of steps
     pace: Callable[[float], object]  # sets the length of a step [s]
-    move: Callable[[float], Product] | None  # seconds -> exponential step from [s; qacc] to s+
-    kick: Callable[[float], Product] | None  # seconds -> step of s that changes the impedances and speeds only
+    move: Callable[[float], Product] | None  # seconds -> exponential step from [s; qacc] to s+; None: MuJoCo's own
+    kick: Callable[[float], Product] | None  # seconds -> step of s in which positions are fixed; None: no impedances
 
     def put(self, buffer: StepBuffer, k: int) -> None:
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
@@ -245,7 +250,7 @@ class _Access:
         return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
     def _shaped(self, states: Array) -> Array:
-        """Return a view of [q; v] in states (ticks, size, ..); each tick is shaped like `state`."""
+        """Return a view of q and v in states (ticks, size, ..). The view of each tick has the shape of `state`."""
         return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
 
     def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
@@ -281,7 +286,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """Return a function that advances from latch to latch; the forces held at the end follow the state in a row."""
+        """Return a function that advances from latch to latch. The plant state ends with the forces that are held."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -300,7 +305,7 @@ class _Access:
         return advance
 
     def _move_by(self, seconds: float, row: Array) -> None:
-        """Advance MuJoCo and `row`, its present state, by some seconds."""
+        """Advance MuJoCo by some seconds; `row` holds MuJoCo's state before and afterwards."""
         (view,) = self._shaped(row[None])
         if self.move:
             for _ in range(self.substeps):
@@ -325,7 +330,7 @@ class _Access:
 
 
 class MujocoEngine:
-    """An engine for one simulation in one MjData, which a viewer can show; MuJoCo's ctrl holds the inputs."""
+    """An engine for one simulation in one MjData, which a viewer can show."""
 
     def __init__(
         self, scene: Scene, T: float, integrator: str = "RK4", substeps: int | None = None, timing: Timing | None = None
@@ -338,7 +343,7 @@ class MujocoEngine:
         self._warnings = self.data.warning.number
         self.run_block: RunBlock | None = None
         stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
-        # MuJoCo solves friction with a warm start, which `back` cannot restore.
+        # With friction MuJoCo starts its solver from the last solution, which `back` cannot restore.
         self._smooth = default_integrator(scene) == EXPONENTIAL
         self._one_step = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
@@ -420,8 +425,8 @@ class MujocoEngine:
 class MujocoBatchEngine:
     """An engine for all simulations of a buffer, one per set of humans, in one mujoco.batch.Batch.
 
-    Each simulation has the same bits as in MujocoEngine, except with the exponential integrator or with impedances:
-    their matrix products are summed in another order and differ by rounding.
+    Each simulation has the same bits as in MujocoEngine. Exceptions are the exponential integrator and impedances,
+    whose matrix products are summed in another order and differ by rounding.
     """
 
     def __init__(
@@ -447,7 +452,7 @@ class MujocoBatchEngine:
         moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
-        # MuJoCo's own integrators use the matrices of the plants for impedances only.
+        # With MuJoCo's own integrators, only steps of impedances need the matrices of the plants.
         exact_step = integrator == EXPONENTIAL or held_by.impedances
         plants = held_by.plants() if exact_step else _stacked(held_by.scene.plant)
 
@@ -505,14 +510,14 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Return a function that multiplies column j by matrix j; a single matrix multiplies all columns."""
+    """Return a function that multiplies column j by matrix j, or all columns by a single matrix."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 
 def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """Copy the scene's model for `substeps` steps of `integrator` in a period T.
+    """Return a copy of the scene's model for `substeps` steps of `integrator` in a period T.
 
-    Raises ValueError for impossible settings (InputError if the scene excludes the integrator).
+    Raises ValueError for impossible settings, and InputError if the scene does not permit the integrator.
     """
     import mujoco
 
@@ -584,7 +589,10 @@ class _PlantSpeed:
 
 
 def pace(A: Array) -> _PlantSpeed:
-    """Return the fastest motions of x' = A x, or of a stack; a mode with |Im| > |Re| counts as weakly damped."""
+    """Return the fastest motions of x' = A x, or of all systems of a stack.
+
+    A mode counts as weakly damped if its eigenvalue has |Im| > |Re|.
+    """
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

@@ -52,7 +52,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
     ]
 
 
-#: The transparency indices (25) [dB] that the paper prints. No reading of its Figure 4 that was tried reproduces them.
+#: The transparency indices (equation 25) [dB] that the paper prints. No tried reading of its Figure 4 reproduces them.
 _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
@@ -122,7 +122,7 @@ class DelaySpan:
     pattern: str
     loss: float  # probability that a packet is lost
     playout: bool  # whether a buffer in the device makes the delay hi
-    constant: bool  # whether every force has the delay theta
+    constant: bool  # whether the delay is theta at every tick
 
     @classmethod
     def of(cls, varying: VaryingDelay) -> DelaySpan:
@@ -131,7 +131,7 @@ class DelaySpan:
 
 @dataclass(frozen=True)
 class _Age:
-    """Ages of the forces in use, per channel, once a force has arrived on every channel [samples]."""
+    """Ages [samples] of the forces that each device applies, from the tick at which every channel has a force."""
 
     least: list[int]
     largest: list[int]
@@ -140,7 +140,7 @@ class _Age:
 
 @dataclass(frozen=True)
 class _PeriodGrowth:
-    """Growth over one period of the worst switching of delays that was found."""
+    """Growth of the linear loop over one period of the worst switching of delays that the search found."""
 
     ticks: int
     growth_rate_per_s: float
@@ -181,12 +181,12 @@ class _DelaysMet:
 
     @property
     def worst(self) -> _DelaysMet | _PeriodGrowth:
-        """The record with the decisive growth: the worst switching if it was searched, else the run's delays."""
+        """The record whose growth decides: that of the worst switching if a search was made, else that of the run."""
         return self.period or self
 
     @property
     def how(self) -> str:
-        """The method behind the growth of `worst`, in words."""
+        """The method that gave the growth of `worst`, in words."""
         if self.period:
             return f"growth by the eigenvalues of the map over one period of {self.period.ticks} ticks"
         return f"growth of the linear loop after an impulse, over {self.judged_s:.3g} s under the run's delays"
@@ -241,7 +241,7 @@ class UnevenTicks:
 
 
 def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
-    """Return the verdict on a run with switching delays, for which one tick's eigenvalues decide nothing."""
+    """Return the verdict on a run whose delays switch, so that eigenvalues of a single tick decide nothing."""
     met = delays.met
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))
@@ -284,14 +284,14 @@ class Ran:
     interrupted: bool
     scenario_digest: str
     encoder_step_m: Array
-    steady_ticks: list[list[int]]  # [first, stop] of the ticks before the first clipped one
+    steady_ticks: list[list[int]]  # one pair [first, stop]: the ticks before the first clipped force
     environment: str  # name of the environment that ran
     unsolved: int  # number of times that limited forces were set to 0 because no solution was found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """The result of a run; missing parts are null."""
+    """The result of a run. In JSON a missing part is null."""
 
     case: str
     scenario: str
@@ -317,7 +317,7 @@ class RunReport:
 
     @property
     def compares_sent_forces(self) -> bool:
-        """Whether `ideal_force` compares forces as the devices received them, not forces before clipping."""
+        """Whether `ideal_force` compares the forces that the devices received instead of forces before clipping."""
         return self.switched or self.energy_budget is not None or self.assessment.force_limits.rho is not None
 
     def notes(self) -> list[str]:
@@ -339,7 +339,7 @@ class RunReport:
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            # Any other reason explains tau, which only the JSON shows.
+            # Any other reason explains the index tau, which only the JSON has.
             "transparency": transparency and transparency.relative_mismatch == 0 and transparency.reason,
             "credible": self.credible.reason,
             **{name: part.reason for name, part in certificates.items()},

@@ -3,7 +3,7 @@
     trace = run(assemble(scenario, coupling), "mujoco")
 
 A tick samples the positions, computes, limits and holds the forces, and advances the plant by one period. The module
-controller.tick explains the order of these steps, and sim.engines the last step.
+controller.tick explains the order of these steps. Engines (sim.engines) advance the plant.
 """
 
 from __future__ import annotations
@@ -53,24 +53,24 @@ ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, an engine, or a class or function that makes one
 
 _Outside = Callable[[int, int], Array]  # (first tick, ticks) -> external forces (ticks, external inputs) [N]
-_AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
+_AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, number of its ticks) -> True to stop
 Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 
 _COPIES = 4  # largest number of copies of a trace that a run and its report keep in memory
 _SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
-_COLUMNS = 50  # numbers per tick that a report needs in memory even if the trace is on disk
-_BLOCK = 2048  # ticks between two calls of `progress`, each with a check of the numbers and of the engine
+_COLUMNS = 50  # numbers per tick that a report keeps in memory if the trace is on disk
+_BLOCK = 2048  # ticks between two calls of `progress`; the run also checks its numbers and the engine there
 _AHEAD = 8  # number of blocks for which external forces are sampled together
 
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Engine, integrator and steps of a run; a None of `integrator` or `substeps` means the default for the plant."""
+    """Engine, integrator and steps of a run. If `integrator` or `substeps` is None, the plant's default is used."""
 
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # name in sim.engines.INTEGRATORS
     substeps: int | None = None  # integrator steps per period
-    error: float | None = None  # allowed relative rms error of positions; the cheapest setting within it then runs
+    error: float | None = None  # allowed relative rms error of positions; if given, it chooses integrator and substeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,27 +81,27 @@ class Simulation:
     coupling: Coupling
     process: Process
     scene: Scene
-    plant: HeldPlant  # the plant over periods T, with forces that latch in the middle of the range of latencies
+    plant: HeldPlant  # the plant over a period T; forces latch in the middle of their range of latencies
     timing: Timing | None = None  # begin and latch times of ticks; None without `period` and `latency` in the scenario
 
     @cached_property
     def loop(self) -> Loop:
-        """The loop of case I, as designs see it; a run does not use its reference delays."""
+        """The loop of case I for linear analyses, which do not use its reference delays."""
         return self.scenario.loop("I")
 
     @cached_property
     def E(self) -> Lti:
-        """The environment, with every wall touching."""
+        """The environment as a linear system in which every wall is touched."""
         return self.loop.E()
 
     @property
     def F(self) -> Lti:
-        """The force map while no wall touches, at the constant delays."""
+        """The map from positions to forces at constant delays while no wall is touched."""
         return self.process.law.open
 
     @property
     def friction(self) -> bool:
-        """Whether a device has Coulomb friction, which the scene contains and `plant` does not."""
+        """Whether a device has Coulomb friction. `scene` includes this friction, but the linear `plant` does not."""
         return any(np.any(device.friction) for device in self.scenario.device)
 
     @property
@@ -135,22 +135,22 @@ class Simulation:
 
     @property
     def felt(self) -> Lti:
-        """The force map with every wall touching."""
+        """The map from positions to forces at constant delays while every wall is touched."""
         return list(self.process.law.frozen().values())[-1]
 
 
 def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
-    """Build the computer's process and the plant.
+    """Return the scenario's controller and plant, ready to run.
 
-    `lag` is the `rho` (m,) [N/m] of controller.law.Limiter; with None, forces are clipped. `seed` is the seed of
-    varying periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no
-    solution, and InputError for walls with a coupling that holds a linear model.
+    `lag` is `rho` (m,) [N/m] of controller.law.Limiter; if it is None, forces are clipped. `seed` is for varying
+    periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no solution, and
+    InputError if the loop has walls and the coupling holds a linear model.
     """
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     axes = scenario.axis_devices
     limits, steps = (np.array([getattr(axis, of) for axis in axes]) for of in ("force_limit", "encoder_step"))
-    if scenario.environment.world:  # A net (controller.tick.Net) of sim.world gives the forces.
+    if scenario.environment.world:  # This law returns zero forces, because sim.world computes those of a scene.
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
         most, balls = scenario.limiter_limits
@@ -174,7 +174,7 @@ def run(
 
     Args:
         simulation: The loop.
-        engine: An engine, a class or function that makes one, or a name; a named engine takes its default step.
+        engine: An engine, a class or function that makes one, or a name, which selects the engine's default step.
         outside: External forces on hands and handles; default: `outside_forces`.
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
@@ -185,7 +185,7 @@ def run(
         The trace. It ends early when a number stops being finite or the engine reports trouble.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C without `may_end_early`, or in the first block of 2048 ticks.
+        KeyboardInterrupt: Ctrl-C was pressed, and `may_end_early` is False or fewer than 2048 ticks are done.
         ValueError: `engine` is no engine for this loop (`make_engine`), or the trace is too large (InputError).
     """
     process, scenario = simulation.process, simulation.scenario
@@ -232,7 +232,7 @@ def run(
 
 
 def _finite_ticks(buffer: StepBuffer, count: int) -> int:
-    """Return the number of ticks before the first one whose state or force is not finite, at most `count`."""
+    """Return how many of the first `count` ticks precede the first state or force that is not finite."""
     if np.isfinite(buffer.rows[:count].sum()):
         return count
     finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
@@ -247,7 +247,7 @@ def _columns(rows: Array, which: tuple[int, ...]) -> Array:
 def _room(width: int, ticks: int, T: float) -> Array:
     """Return an array (ticks, width) in memory, or in a temporary file if the memory is too small.
 
-    Raises InputError if the report of such a trace does not fit into memory, or if twice the trace exceeds the disk.
+    Raises InputError if the trace's report does not fit into memory, or if the disk cannot hold the trace twice.
     """
     shape, each = (ticks, width), 8 * width
     free = _free_memory() if each * ticks > _SMALL else np.inf
@@ -282,13 +282,13 @@ def run_blocks(
 ) -> None:
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), block by block.
 
-    `each_block` is called after each block and returns True to stop. Row 0 of the buffer is the block's first tick. The
-    default block is small enough for the processor's cache. Raises InputError for an engine without `advance`.
+    `each_block` is called after each block, and returns True to stop. Row 0 of the buffer is then the block's first
+    tick. A block of 32 ticks fits into the processor's cache. Raises InputError for an engine without `advance`.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
     buffer.s[0] = start
-    # The trace reports divergence, so warnings are suppressed.
+    # Warnings of overflow are suppressed, because the trace reports that a run diverges.
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
         if not callable(getattr(engine, "advance", None)):
@@ -308,7 +308,9 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     first = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
-        engine.run_block(ticks)  # This runs the law without limits; `linear_until` then checks the forces.
+        engine.run_block(
+            ticks
+        )  # The engine ignores force limits; `linear_until` returns the first tick that violates one.
         first = buffer.linear_until(ticks)
         if first == ticks:
             return
@@ -330,8 +332,8 @@ def outside_forces(
 ) -> Array:
     """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, external inputs).
 
-    The voluntary force, left out if `voluntary` is False, acts on the end of each human, the tap on one handle. Raises
-    InputError for a voluntary force of wrong shape, or one that is not finite.
+    Voluntary forces act on the ends of the humans, and the tap on one handle. `voluntary` = False leaves out voluntary
+    forces. Raises InputError for a voluntary force that has a wrong shape or is not finite.
     """
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))
@@ -367,11 +369,18 @@ def make_engine(
     substeps: int | None = None,
     T: float | None = None,
 ) -> Engine:
-    """Return the engine `engine` for one simulation; a tick of MuJoCo lasts T [s] (default: the scenario's period).
+    """Return an engine for one simulation.
 
-    The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's class or function is
-    called with the simulation. Raises ValueError for an unknown name, an object that is no engine, the exact engine
-    with Coulomb friction, or a user's own engine with `period` or `latency`.
+    Args:
+        simulation: The loop.
+        engine: The name of an engine, a user's engine, or a class or function that makes one from the simulation.
+        integrator: MuJoCo's integrator; default: `default_integrator`.
+        substeps: MuJoCo's steps per tick; default: `least_substeps`.
+        T: Length [s] of a tick of MuJoCo; default: the ticks of the scenario.
+
+    Raises:
+        ValueError: The name is unknown, the object is no engine, a device has Coulomb friction with the exact engine,
+            or the scenario has `period` or `latency` with a user's own engine.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)

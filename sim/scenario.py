@@ -1,7 +1,7 @@
 """Scenarios: devices, humans, environment, delays and timing of one loop, read strictly from TOML.
 
-Unknown keys and impossible numbers are refused. Humans can be in a separate file, so that humans that a search found
-(sim.adversary) can be simulated again.
+Unknown keys and impossible numbers are refused. A separate file can hold the humans. sim.validate writes such files, so
+that sim.run can simulate the worst humans again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from haptic_loop.design.own import called, named, place_of
 from haptic_loop.models.device import AXES, MOST_DAMPING, Device, Mechanics, fields_of, require, symmetric
 from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
-CASES = ("none", "I", "II")  # no coupling, or the paper's case of the reference delays
+CASES = ("none", "I", "II")  # "none": no coupling; "I", "II": the paper's two cases of reference delays
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
@@ -75,8 +75,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     name: str
-    unit: PositionUnit = "m"  # unit of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
-    radius: float | None = None  # [m] distance of the hand from a rotary device's axis, for a session's limits
+    unit: PositionUnit = (
+        "m"  # unit of positions; with "rad", for rotary devices, forces are in N m, dampings in N m s/rad
+    )
+    radius: float | None = (
+        None  # [m] distance of the hand from a rotary device's axis; sessions limit the force at the hand
+    )
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples], the paper's equation 4
     psi: _Delays = _UNSAID  # environment delays [samples], equation 5; default: 0
@@ -84,14 +88,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     human: tuple[Human, ...] = _UNSAID  # the hands that hold the devices in a run; default: `_usual_hand`
     environment: Network
     ranges: Ranges | None = None  # environments that guarantees must cover besides the nominal one
-    lam: _Delays | None = None  # reference delays [samples], equation 7; None: `reference_delays` of the case
+    lam: _Delays | None = None  # reference delays [samples], equation 7; None: those of the case (`reference_delays`)
     person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # simulated time [s]
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
-    T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
-    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; it exceeds every latency
+    T_max: float | None = None  # [s] the longest period if periods vary; certificates hold for all periods up to T_max
+    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; latencies are shorter
     period: Periods | None = None  # the simulated periods; the coupling is computed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 
@@ -193,7 +197,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def axis_devices(self) -> tuple[Any, ...]:
-        """One device per channel, with numbers as fields; `device` itself if all devices have one axis."""
+        """For each channel a device with one axis, whose fields are numbers; `device` itself if all have one axis."""
         if all(device.axes == 1 for device in self.device):
             return self.device
         return tuple(axis for device in self.device for axis in device.channels())
@@ -205,15 +209,16 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def balls(self) -> tuple[slice, ...]:
-        """The channels of each device whose `force_limit` bounds the length of its force vector."""
+        """The channels of each device whose `force_limit` bounds the length of the force vector, not each axis."""
         ends = np.cumsum([0, *(len(device.free) for device in self.device)]).tolist()
         return tuple(slice(a, b) for device, a, b in zip(self.device, ends, ends[1:], strict=False) if device.ball)
 
     @property
     def limiter_limits(self) -> tuple[tuple[float, ...], tuple[slice, ...]]:
-        """Limits (m,) [N] of a limiter, and the channels of each force vector whose length it limits.
+        """Limits (m,) [N] of a limiter, and the channels of each force vector whose length the limiter bounds.
 
-        The limiter cannot combine vectors with walls. With walls each of a vector's n axes gets 1/sqrt(n) of the limit.
+        No limiter bounds the length of vectors in a loop with walls. There each of a vector's n axes gets 1/sqrt(n) of
+        the vector's limit.
         """
         limits = [device.force_limit for device in self.axis_devices]
         if not self.environment.walls:
@@ -224,7 +229,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lead(self) -> list[int]:
-        """For each channel, the first channel of its device, whose drawn delay and latency all axes share."""
+        """For each channel, the first channel of its device. All axes share that channel's drawn delay and latency."""
         counts = [len(device.free) for device in self.device]
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
@@ -261,7 +266,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def switches(self) -> bool:
-        """Whether the delay of the forces is anything but the constant theta."""
+        """Whether the delay of the forces differs from theta at some tick."""
         return self.varying_delay is not None and not self.varying_delay.steady
 
     @property
@@ -278,7 +283,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delta(self) -> tuple[float, ...]:
-        """The guaranteed damping on each channel [N s/m]; of a damping matrix, the diagonal."""
+        """The guaranteed damping on each channel [N s/m]. For a device with a damping matrix this is its diagonal."""
         return tuple(device.passivity_level for device in self.axis_devices)
 
     @property
@@ -296,14 +301,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def longest_period(self) -> float | None:
-        """The period that certificates must cover: T_max, or the longest simulated one; None if every period is T."""
+        """The longest period for certificates: T_max, or the longest simulated period; None if every period is T."""
         if self.T_max is not None or self.period is None:
             return self.T_max
         return max(self.period.longest, self.T)
 
     @property
     def shortest_period(self) -> float | None:
-        """The shortest period that certificates must cover: T_min, or the shortest simulated one; None without both."""
+        """The shortest period for certificates: T_min, or the shortest simulated period; None without both."""
         if self.T_min is not None or self.period is None:
             return self.T_min
         return min(self.period.shortest, self.T)
@@ -325,7 +330,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.period is not None or any(least < most for least, most in self.latency or ())
 
     def timing(self, seed: int, ticks: int) -> Timing | None:
-        """Draw the times at which ticks begin and forces latch; None without `period` and `latency`."""
+        """Draw and return the times at which ticks begin and forces latch; None without `period` and `latency`."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
         timing = drawn(self.T, self.period, self.latency, ticks, rng)
         if timing is None or timing.late is None or self.axis_devices is self.device:
@@ -340,13 +345,16 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.unit == "m":
             del contents["unit"], contents["radius"]
         contents["device"] = [_given_fields(device) for device in self.device]
-        if self.environment.world:  # The contents of the world's files count, not their folder.
+        if self.environment.world:  # The digest depends on the contents of a world's files, not on their folder.
             contents["environment"] = _without_folder(self.environment)
         content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
         return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
-        """Return Lambda: `lam` if set, else 0 in case II, else theta + psi. Raises InputError for an unknown case."""
+        """Return the reference delays [samples]: `lam` if given, otherwise 0 in case II and theta + psi in case I.
+
+        Raises InputError for an unknown case.
+        """
         if case not in CASES:
             raise InputError(f"case is {case!r}, allowed are {', '.join(CASES)}")
         if self.lam is not None:
@@ -368,13 +376,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lever(self) -> float:
-        """The radius [m] at which a hand holds a rotary device, else 1; it converts between N and N m, m and rad."""
+        """The radius [m] at which a hand holds a rotary device. It converts N to N m, and rad to m; otherwise 1."""
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:
-        """Return the loop that designs and proofs see: the devices' damping and guaranteed bounds, but no humans.
+        """Return the loop for designs and proofs. It has the devices' damping and guaranteed bounds, but no humans.
 
-        `case` is "none", "I" or "II"; raises InputError for another case.
+        `case` is "none", "I" or "II". Raises InputError for another case.
         """
         span, known, counts = self.delay_range, self.known_devices, tuple(len(device.free) for device in self.device)
         return Loop(
@@ -404,18 +412,18 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         theta, late, delta = self.theta[:1], self.latency and self.latency[:1], self.delta[:1]
         if self.device[0].axes > 1:
             least = np.linalg.eigvalsh(self.device[0].matrix("delta"))[0]
-            # The factor covers the rounding of eigvalsh.
+            # The factor 1 - 1e-12 covers the rounding of eigvalsh.
             delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)
         known, longest = self.known_devices, self.longest_period
         more: dict[str, Any] = {"known_devices": known[:1], "T_min": self.shortest_period} if known else {}
         return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, T_max=longest, unit=self.unit, **more)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
-        """Return the scenario with some fields changed; `delta` is another guaranteed damping per device [N s/m].
+        """Return the scenario with some fields changed; `delta` gives each device another guaranteed damping [N s/m].
 
-        Values are checked and normalised like those of a file. Three fields may also be objects of a user's own class:
-        humans (models.human.Hand), a population with `draw(rng, n)`, which returns n humans, and an environment with
-        `contacts` and `E(T)` or `parts()`. Raises InputError for a wrong value.
+        The scenario checks and normalises values as in a file. Three fields may also be objects of a user's own class:
+        humans (models.human.Hand), a population with a method `draw(rng, n)` that returns n humans, and an environment
+        with `contacts` and `E(T)` or `parts()`. Raises InputError for a wrong value.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
@@ -436,13 +444,16 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def own_environment(text: str) -> Any:
-    """Load an environment from FILE.py:NAME; a class or a function is called. Raises InputError if this fails."""
+    """Return the object NAME of FILE.py, or the result of calling it if it is a class or function.
+
+    Raises InputError if this fails.
+    """
     own = named("--environment", text)
     return called(f"--environment {text}", own) if callable(own) else own
 
 
 def load(source: str | Path = DEFAULT) -> Scenario:
-    """Load a scenario from a TOML file, or a built-in one by name. Raises InputError if it is missing or invalid."""
+    """Return the scenario of a TOML file, or a packaged one by name. Raises InputError if it is missing or invalid."""
     if not isinstance(source, str | Path):
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
@@ -454,9 +465,9 @@ def load(source: str | Path = DEFAULT) -> Scenario:
 
 
 def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenario:
-    """Parse TOML text as a scenario. The path of a world's file is relative to `folder`.
+    """Return the scenario of a TOML text. The path of a world's file is relative to `folder`.
 
-    Raises InputError with the path of the field and its value, and TypeError for anything but text.
+    Raises InputError with the path and the value of a wrong field, and TypeError unless `text` is a str.
     """
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
@@ -491,7 +502,7 @@ def require_no_world(scenario: Scenario, what: str) -> None:
 
 
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
-    """Raise InputError if a loop has Coulomb friction or walls; `walls` permits walls."""
+    """Raise InputError if a loop has Coulomb friction, or has walls although `walls` is False."""
     for i, device in enumerate(scenario.device, start=1):
         if np.any(device.friction):
             friction = list(device.friction) if isinstance(device.friction, tuple) else f"{device.friction:g}"
@@ -530,11 +541,14 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own class
     person: tuple[Person, ...] = ()
     population: Any = None  # a user's own population with draw(rng, n)
-    device: tuple[Mechanics, ...] = ()  # mechanics that sim.validate drew within the guaranteed bounds, or none
+    device: tuple[Mechanics, ...] = ()  # mechanics that sim.validate drew within the guaranteed bounds, or ()
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
-    """Return the scenario with the people of a TOML file or of FILE.py:NAME. Raises InputError if they do not fit."""
+    """Return the scenario held by the people of a TOML file or of FILE.py:NAME.
+
+    Raises InputError if these people do not fit the scenario.
+    """
     people = _load_humans(text, len(scenario.device))
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
@@ -551,7 +565,7 @@ def held_by(scenario: Scenario, text: str) -> Scenario:
 
 
 def _load_humans(text: str, devices: int) -> _HumanFile:
-    """Load the people of a TOML file or of FILE.py:NAME. Raises InputError for an invalid file."""
+    """Return the people of a TOML file or of FILE.py:NAME. Raises InputError for an invalid file."""
     own = ".py" in text
     try:
         people = _own_humans(text) if own else _humans_of(read_text(text, f"--human {text}"), f"--human {text}")
@@ -589,7 +603,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 
 
 def _own_humans(text: str) -> _HumanFile:
-    """Return the people of FILE.py:NAME: a list, a population, or a function or class that makes one of them."""
+    """Return the people of FILE.py:NAME. NAME is a list, a population, or a function or class that makes either."""
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
         people = called(f"--human {text}", people)
@@ -614,7 +628,10 @@ def save_humans(
     persons: tuple[Person, ...] = (),
     mechanics: Sequence[Mechanics] = (),
 ) -> Path:
-    """Write humans, persons and drawn mechanics of the devices, without voluntary motion. `remark` is a comment."""
+    """Write a file for --human, and return its path: humans without voluntary motion, persons, devices' mechanics.
+
+    `remark` becomes a comment at the top.
+    """
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
         rows = (
@@ -661,7 +678,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 def _require_keys(raw: dict[str, Any]) -> None:
     """Raise ValueError if a key is missing that every scenario or every rotary device needs."""
     missing = [name for name in _NEEDED if name not in raw]
-    # Unknown keys, such as misspelt ones, are reported first, by msgspec.convert.
+    # If there are unknown keys, msgspec.convert reports them instead: a key may be missing because it is misspelt.
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
     devices = raw.get("device") if raw.get("unit") == "rad" else None
@@ -677,7 +694,10 @@ def _require_keys(raw: dict[str, Any]) -> None:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace names of devices in the catalogue by their fields. Raises InputError for an unknown name."""
+    """Return the table with the fields of catalogue devices in place of their names.
+
+    Raises InputError for an unknown name.
+    """
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -697,7 +717,7 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
-    """Give each point of an environment one node per axis if the devices have several axes.
+    """Return the table with one node per axis for each point of the environment, if the devices have several axes.
 
     The node of a clamped axis is the ground. Raises ValueError if contacts or springs do not fit the devices.
     """
@@ -705,7 +725,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
-        return raw  # Either there is one axis, or msgspec.convert refuses the number of axes.
+        return raw  # All devices have one axis, or msgspec.convert will refuse the number of axes.
     if not isinstance(table, dict) or table.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
@@ -737,10 +757,9 @@ def _listed(value: Any) -> list[str]:
 
 
 def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
-    """Convert a spring whose stiffness or damping is a list or a matrix to springs along its principal directions.
+    """Return springs along principal directions for a spring whose stiffness or damping is a list or a matrix.
 
-    Raises ValueError if such a spring also has `along`, and for a matrix that is not symmetric and positive
-    semidefinite.
+    Raises ValueError if this spring also has `along`, or if the matrix is not symmetric and positive semidefinite.
     """
     fields = ("stiffness", "damping")
     several = [f for f in fields if isinstance(spring, dict) and isinstance(spring.get(f), list)]
@@ -773,7 +792,10 @@ _DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Add path and digest of a world's MJCF file, and directions of contacts. Raises ValueError for a wrong world."""
+    """Return the table with path and digest of a world's MJCF file and with the directions of its contacts.
+
+    Raises ValueError for a wrong world.
+    """
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
         if extra := [key for key in ("along", "every") if isinstance(table, dict) and key in table]:
@@ -801,7 +823,7 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
-    """Return the unit vectors along which a contact with these coordinates slides."""
+    """Return the unit vectors along which a contact slides; `nodes` has its node for each axis."""
     return [row for row, node in zip(np.eye(len(AXES)).tolist(), nodes, strict=False) if node != GROUND]
 
 
@@ -824,7 +846,7 @@ def _direction(number: int, row: Any) -> list[float]:
 
 
 def _without_folder(environment: Network) -> Network:
-    """Return the environment with the file name of a world in place of its path."""
+    """Return the environment with only the name of a world's file, without its folder."""
     if not environment.world:
         return environment
     world = msgspec.structs.replace(environment.world, file=Path(environment.world.file).name)
@@ -832,7 +854,7 @@ def _without_folder(environment: Network) -> Network:
 
 
 def _network(own: Any, T: Any) -> Network:
-    """Convert a user's own object to a network. Raises InputError for an object that lacks methods."""
+    """Return the network of a user's own object. Raises InputError if the object lacks methods."""
     label = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
     has_E = getattr(type(own), "E", Environment.E) is not Environment.E
@@ -866,7 +888,7 @@ class _Damped(msgspec.Struct, frozen=True):
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
-    """Convert fields to `kind` by the rules of a file. Raises InputError for a wrong field."""
+    """Return the fields as a struct `kind`, by the rules of a file. Raises InputError for a wrong field."""
     raw = {name: _plain(name, value) for name, value in fields.items()}
     try:
         return msgspec.convert(_in_space(_with_catalogue(raw)), kind)
@@ -875,7 +897,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Convert structs, tuples and NumPy's types to the types of a file. Raises InputError for any other type."""
+    """Return structs, tuples and NumPy's types as types of a file. Raises InputError for any other type."""
 
     def of_numpy(part: Any) -> Any:
         if isinstance(part, np.ndarray | np.generic):
@@ -925,7 +947,7 @@ def _checked_own(value: Any) -> Any:
 
 
 def _given_fields(device: Device) -> dict[str, Any]:
-    """Return the fields of a device, without newer fields of default value, so that old digests stay valid."""
+    """Return the fields of a device. Newer fields with their default value are left out: old digests stay valid."""
     fields = msgspec.to_builtins(device)
     for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
         if fields.get(name) == default:
@@ -934,12 +956,12 @@ def _given_fields(device: Device) -> dict[str, Any]:
 
 
 def _contents(part: Any) -> Any:
-    """Return the contents of an array, or of a user's own human or population, for the digest."""
+    """Return what the digest hashes of an array, or of a user's own human or population."""
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
 def _located(message: str, raw: dict[str, Any]) -> str:
-    """Rewrite 'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
+    """Return 'theta #1 = 1.5: expected `int`, got `float`' for 'Expected `int`, got `float` - at `$.theta[0]`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
     assert match
     problem, path = match[1], match[2] or ""
