@@ -1,8 +1,8 @@
 """Search for limit cycles of devices in human hands: eigenvalues for every human, MuJoCo for the worst human.
 
-A cell of a Z-width map has a force map F and a process that computes it. `HeldDevices` closes F around the devices in
-the hands of every human; here a human is a set of hands, one for each device. `simulate_cells` runs cells in MuJoCo,
-with encoder steps, friction and walls.
+A cell of a Z-width map has a map F from positions to forces, and a controller's process that computes F. A human is
+here a set of hands, one for each device. `HeldDevices` closes the loop of F and the devices in the hands of every
+human. `simulate_cells` runs cells in MuJoCo, with encoder steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from haptic_loop.sim.trace import RUNAWAY, Oscillation, oscillation, slowest_see
 
 Cells = NDArray[np.intp]
 
-_MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes decay slowly and would hide one about to grow
+_MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes barely decay, and would hide a faster one
 _LEADING = 0.1  # share of the humans that `leading` selects
 
 
 @dataclass(frozen=True, eq=False)
 class HeldDevices:
-    """Sampled devices in the hands of every human, in groups of humans with the same number of links."""
+    """The sampled devices in the hands of every human. A group has the humans with the same number of links."""
 
     devices: tuple[Device, ...]  # (m,)
     T: float  # [s]
@@ -53,10 +53,10 @@ class HeldDevices:
         links: int | None = None,
         latency: Sequence[tuple[float, float]] | None = None,
     ) -> HeldDevices:
-        """Draw random humans for the devices.
+        """Return the devices in the hands of random humans.
 
         `links` is the number of links of each hand; None means that of the population. `latency` has the least and the
-        largest latency [s] of each channel's forces, of which the largest is used.
+        largest latency [s] of each channel's forces; forces latch after the largest.
         """
         late = None if latency is None else tuple(most for _, most in latency)
         groups = []
@@ -78,9 +78,9 @@ class HeldDevices:
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Return the growth (n,) [1/s] of the dominant mode and of the dominant fast mode of F with every human.
+        """Return two growth rates (n,) [1/s] of the loop of F with every human: of the dominant mode and fast mode.
 
-        A fast mode has at least `min_frequency_hz`. Where the mask `humans` (n,) is false, the growth is -inf.
+        A fast mode has at least `min_frequency_hz`. Where the mask `humans` (n,) is False, the growth is -inf.
         """
         n = len(self)
         everything, turning = np.full((2, n), -np.inf)
@@ -108,7 +108,8 @@ class HeldDevices:
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
         """Return a mask (n,) of a tenth of the humans, at least 8 if there are so many.
 
-        First come those who are unstable with most of the force maps `some`, then those whose loops grow fastest.
+        The mask selects first the humans who are unstable with most of the force maps `some`, then those whose loops
+        grow fastest.
         """
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
@@ -126,24 +127,24 @@ class HeldDevices:
 
 
 def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
-    """Return indices of a plant state; a rigid device has one, for motor and handle."""
+    """Return the indices of motors and handles in a plant state; in a rigid device both have one index."""
     return tuple(dict.fromkeys((*range(scene.channels), *scene.handles)))
 
 
 # ----------------------------------------------------------------------------------------------------
-# Cells in MuJoCo. The devices are held by the human whose exact linear loop is nearest to oscillating or running away.
-# Plant and process start in the loop's dominant mode that a trace can show, scaled so that the motor or handle that
-# moves most is displaced by _START. Each hand presses with a force that starts smoothly and then stays constant. The
-# second half of the trace gives the verdict.
+# Cells in MuJoCo. The human with whom the exact linear loop grows fastest holds the devices. Only modes that a trace
+# can show count: they oscillate fast enough, or run away. Plant and process start in this mode, scaled so that the
+# motor or handle that moves most is displaced by _START. Each hand presses with a force that starts smoothly and then
+# stays constant. The second half of the trace gives the verdict.
 
 
-_UNLIMITED = 1e6  # [N] largest force limit that a device may have
+_UNLIMITED = 1e6  # [N] the largest allowed force limit of a device, which no force here reaches
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] time in which the hand's force grows to its constant value
 _START = 1e-3  # [m] initial displacement of the motor or handle that moves most
 _BLOCK = 64  # ticks between two calls of `progress`
-DECIDED = 0.2  # [1/s] a linear growth rate closer to zero than this cannot be seen within a trace
-UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear growth is nearer to zero than DECIDED
+DECIDED = 0.2  # [1/s] A trace is too short to show the sign of a smaller growth rate.
+UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear loop's rate is at most DECIDED
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
@@ -155,7 +156,7 @@ def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
 class Plan:
     """Settings for the simulation of cells."""
 
-    points: int  # largest number of the map's rows, and of its columns, that are simulated; 0 for none
+    points: int  # largest number of rows, and of columns, of the map with simulated cells; 0: no cell is simulated
     press: float  # [N] steady force of every hand
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a motor or handle oscillates
@@ -174,7 +175,7 @@ class Points:
     oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace
     amplitude: Array  # [m] amplitude of the oscillation; inf if the trace diverged
     frequency_hz: Array  # [Hz] frequency of the oscillation; nan if the trace diverged
-    growth: Array  # [1/s] growth of the dominant mode that oscillates visibly or runs away, in the exact loop
+    growth: Array  # [1/s] growth, in the exact loop, of the dominant mode that a trace can show
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
@@ -184,7 +185,7 @@ class Points:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """(k,) whether the linear loop grows or decays too slowly to be distinguished from a limit cycle."""
+        """(k,) whether the linear loop grows or decays so slowly that its motion looks like a limit cycle."""
         return np.abs(self.growth) <= DECIDED
 
     @property
@@ -206,7 +207,7 @@ _Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 def simulate_cells(
     cells: Cells, loops: _Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
 ) -> tuple[Points, bool]:
-    """Simulate cells with steady forces `press` (m,) [N]; return the points, and whether the keyboard interrupted."""
+    """Simulate cells, and return the points and whether the keyboard interrupted; hands press with `press` (m,) [N]."""
     parts: list[Points] = []
     ticks = round(plan.duration / held.T)
     try:
@@ -235,11 +236,11 @@ class _Trial:
 
 
 def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:
-    """Return a trial for each cell, and the exact loop's growth [1/s] with its human."""
+    """Return for each cell a trial, and the growth [1/s] of the exact loop with the trial's human."""
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)
-        runs_away = fastest > plan.runaway_growth  # The mode may diverge without an oscillation.
+        runs_away = fastest > plan.runaway_growth  # A mode that runs away need not oscillate.
         shown = np.where(runs_away, fastest, swinging)
         human = int(np.argmax(shown))
         mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
@@ -273,7 +274,7 @@ def _points(
 def _simulate(
     trials: Sequence[_Trial], held: HeldDevices, press: Array, plan: Plan, ticked: Callable[[int], None]
 ) -> Oscillation:
-    """Simulate all trials together; their humans must have the same number of links."""
+    """Simulate all trials together, and return their oscillations; humans must have the same number of links."""
     T = trials[0].process.F.T
     held_by = variants(unlimited(held.devices), Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(plan.duration / T)

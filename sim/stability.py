@@ -1,7 +1,7 @@
 """Stability by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
 
-A closed loop or a mode may be a stack, one for each set of humans. Arrays of a stack have a leading axis. A contact
-state is a set of walls that are touched; frozen means that contact is neither made nor broken.
+A closed loop or a mode may be a stack with an entry for each set of humans. Arrays of a stack have a leading axis. A
+frozen loop is the linear loop in which a certain set of walls is touched, so that contact is neither made nor broken.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from haptic_loop.sim.trace import Trace
 #: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s] errors of engines may change the sign of a smaller growth rate
-_JUDGED = 4.0, 20.0, 100.0  # [s] durations, tried in turn until the sign of a varying loop's growth is certain
+_JUDGED = 4.0, 20.0, 100.0  # [s] durations that are tried until the sign of a growth rate is certain (linear_growth)
 _SHIFT, _INVERSE_STEPS = 1e-11, 4  # distance from the eigenvalue and number of steps of inverse iteration
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
 _SHORTEST_TRACE = 200  # ticks that a growth rate needs
-SETTLED = 10.0  # time constants before which fast decaying modes may still hide a slow growing one
+SETTLED = 10.0  # duration, in time constants of the rate, from which the sign of a rate is certain (linear_growth)
 _DECAY_TIMES = 4.0  # least duration of a trace, in time constants, for the sign of its rate to count
 
 
@@ -68,7 +68,7 @@ class ClosedLoop:
         return np.linalg.eigvals(self.A).astype(complex)
 
     def growths(self, *min_frequency_hz: float) -> list[Array]:
-        """Return the growth [1/s] of the dominant mode at or above each of these frequencies [Hz]."""
+        """Return a growth [1/s] for each frequency [Hz]: that of the dominant mode at or above this frequency."""
         values = self.eigenvalues
         size, hz = np.abs(values), np.abs(np.angle(values)) / (2 * np.pi * self.T)
         return [np.log(np.where(hz >= least, size, _NO_MODE).max(axis=-1)) / self.T for least in min_frequency_hz]
@@ -109,7 +109,7 @@ class Mode:
 
 
 def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
-    """Join the held plant with the force map F: f = C z + D x, z+ = A z + B x, x = C s."""
+    """Return the loop of the held plant with positions x = C s and the force map F: z+ = A z + B x, f = C z + D x."""
     *many, states, inputs = plant.B.shape
     outside, n = inputs - F.outputs, states + F.order
     force = plant.B[..., outside:]
@@ -127,14 +127,14 @@ def dominant_mode(loop: ClosedLoop) -> Mode:
 
 
 def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
-    """Return the dominant mode's unit left eigenvector (..., n); left* xi contains that mode alone.
+    """Return the dominant mode's unit left eigenvector (..., n). The product left* xi contains that mode alone.
 
-    A step of inverse iteration multiplies the share of another mode by _SHIFT over its distance from the dominant one.
+    A step of inverse iteration multiplies the share of each other mode by _SHIFT over the distance of both eigenvalues.
     """
     n, mode = loop.A.shape[-1], dominant_mode(loop)
     shift = (mode.eigenvalue + _SHIFT)[..., None, None] * np.eye(n)
     inverse = np.linalg.inv(np.swapaxes(loop.A, -1, -2) - shift)
-    left = np.sin(1.0 + np.arange(n))[:, None].astype(complex)  # irregular, so not orthogonal to an eigenvector
+    left = np.sin(1.0 + np.arange(n))[:, None].astype(complex)  # irregular, so orthogonal to no eigenvector
     for _ in range(_INVERSE_STEPS):
         left = inverse @ left
         left = left / np.linalg.norm(left, axis=-2, keepdims=True)
@@ -142,7 +142,10 @@ def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
 
 
 def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
-    """Return one exact closed loop for each set of humans; forces latch `late` (m,) [s] after ticks."""
+    """Return the exact closed loop of each set of humans over T [s] (default: that of F).
+
+    Forces latch `late` (m,) [s] after each tick, or at ticks if it is None.
+    """
     return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
@@ -154,10 +157,11 @@ def mujoco_plants(
     nthread: int = 0,
     late: Sequence[float] | None = None,
 ) -> HeldPlant:
-    """Return MuJoCo's map of the plants over one period; if forces latch `late` (m,) [s], held forces are states.
+    """Return MuJoCo's map of the plants over one period.
 
-    The plants are linear, so steps from each basis state and with each force alone give the map. Without `late` it is a
-    power of the map of a substep.
+    The plants are linear, so steps from each basis state and with each force alone give the map. If forces latch `late`
+    (m,) [s] after ticks, the state ends with the forces that are held. Without `late` the map of one substep is
+    measured, and its power is returned.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     substeps = least_substeps(integrator) if substeps is None else substeps
@@ -191,13 +195,13 @@ def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
 
 
 def worst_mode(simulation: Simulation) -> Mode:
-    """Return the dominant mode of the exact loop; with walls, that of its worst frozen contact state."""
+    """Return the dominant mode of the exact loop; with walls, that of the worst frozen loop."""
     return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
 @dataclass(frozen=True)
 class Ringing:
-    """Decay after an impulse in the exact loop with the scenario's own hands, at constant delays and without friction.
+    """How the exact loop with the scenario's hands decays after an impulse, at constant delays and without friction.
 
     A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 for a decay without oscillation.
 
@@ -225,11 +229,11 @@ class Ringing:
         return f"{slowest}; least ratio {self.least_damping_ratio:.4f} at {self.least_frequency_hz:.2f} Hz"
 
 
-_FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero, which rounding spreads
+_FADED = 1e-6  # Rounding moves a delay line's poles at zero to eigenvalues up to this modulus.
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return the decay after an impulse; with walls, the modes of all sets of touching walls count.
+    """Return how the loop decays after an impulse; with walls, the modes of all frozen loops count.
 
     Return None in a world, which has no eigenvalues, and for a loop whose modes are all free drifts.
     """
@@ -243,7 +247,7 @@ def ringing(simulation: Simulation) -> Ringing | None:
         return None
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
-    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # They are one conjugate pair.
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # Both belong to one conjugate pair.
         least = slowest
     shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
     return Ringing(*map(float, shown))
@@ -256,7 +260,7 @@ def exact_growth(simulation: Simulation) -> float:
 
 _NOT_EXCITED = "not excited: the motion does not follow the dominant mode; the verdict is that of the eigenvalues"
 _VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest entry
-_UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
+_UNLIKE = 0.05  # largest relative rms residual of the fit to a trace that follows the dominant mode
 _AT_ONCE = 1 << 16  # ticks that are projected together, to save memory
 
 
@@ -265,9 +269,9 @@ def _measured_growth(
 ) -> tuple[float | None, str | None]:
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
-    The projection y = left* xi contains the dominant mode alone. With the known external force subtracted,
-    y[k+1] - left* B w[k] = lambda y[k]. A least-squares fit gives lambda. The fit ends `ahead` ticks before the first
-    clipped tick, because a limiter acts that long before its force arrives.
+    The projection y = left* xi contains the dominant mode alone, so that y[k+1] - left* B w[k] = lambda y[k] for the
+    external forces w. A least-squares fit gives lambda. A limiter acts up to `ahead` ticks before its force arrives at
+    the device, so the fit ends `ahead` ticks before the first clipped tick.
     """
     clipped = trace.clipped(force_limit, balls)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
@@ -276,7 +280,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # The error of y consists of rounding of its terms, which may cancel, and of the eigenvector's error.
+    # The terms of y may cancel, so its error is the rounding of these terms and the error of the eigenvector.
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -308,28 +312,28 @@ class Eigenvalues(ExactVerdict):
 
 @dataclass(frozen=True, kw_only=True)
 class _Frozen(ExactVerdict):
-    """The verdict of the linear loop in which exactly the walls `touching` touch."""
+    """The verdict of the frozen loop in which exactly the walls `touching` are touched."""
 
     touching: list[int]  # counted from 1
 
 
 @dataclass(frozen=True)
 class _Contact:
-    """Contacts with walls in a run, and the linear loops between which contacts switch."""
+    """Contacts with walls in a run, and the frozen loops between which contacts switch the loop."""
 
     made: int  # number of times that a wall was touched
     ticks: int  # number of ticks in which some wall was touched
     slopes_n_per_m: list[float]  # largest stiffness of each wall (controller.environment.Wall.slope)
-    frozen: list[_Frozen]  # one for every set of touching walls
+    frozen: list[_Frozen]  # an entry for every set of touched walls
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stability(Eigenvalues):
-    """The verdicts of the trace and of the exact loop's eigenvalues (with walls, of the worst contact state)."""
+    """The verdicts of the trace and of the exact loop's eigenvalues; with walls, of the worst frozen loop."""
 
     verdict: str | None  # verdict on the run; None if nothing decides it
     clipped_ticks: int
-    growth_rate_per_s: float | None  # of the trace, or of the linear loop if delays or ticks vary; None: see `reason`
+    growth_rate_per_s: float | None  # of the trace; of the linear loop if delays or ticks vary; `reason` explains None
     frequency_hz: float | None  # strongest frequency of the forces at the end of the trace
     contact: _Contact | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
@@ -411,19 +415,19 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 # Every axis of every handle is pushed once, from rest at x = 0. No trace is stored, only sums.
 
 _IMPULSE = 10e-3  # [s] duration of the push
-_TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls; a hand of 0.3 kg then swings over a few centimetres
-_NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the engine
+_TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls, which swings a hand of 0.3 kg by a few centimetres
+_NOISE_FLOOR = 1e-8  # A mode with a smaller share of the state is noise of the engine.
 
 
 @dataclass(frozen=True, eq=False)
 class ImpulseTest:
     """The results of an impulse test."""
 
-    growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan without fit
-    error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
-    clipped: NDArray[np.int64]  # (nsim,) number of ticks with a force at its limit or, with a limiter, a limited force
-    least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick
-    audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W(N): the scale of its rounding
+    growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan: no fit
+    error: Array  # (nsim,) [1/s] estimated error of `growth`; if it exceeds the rate, the rate's sign is uncertain
+    clipped: NDArray[np.int64]  # (nsim,) number of ticks in which a force is at its limit or a limiter acts
+    least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter, before the first clipped tick
+    audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W(N), to which rounding is relative
     settling: Array  # (nsim,) rms speed of the handles in the last quarter over that in the second quarter
     contacts: NDArray[np.int64]  # (nsim,) number of contacts with walls
     simulated: float  # [s] simulated time of all simulations together
@@ -431,14 +435,14 @@ class ImpulseTest:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """The energy of each tick if forces latch at ticks: the work of the forces and the least dissipation."""
+    """The energies of a tick in which forces latch at its begin: the work of the forces and the least dissipation."""
 
     damping: Array  # (m, 1) [N/m] delta/T
-    Delta: Array | None  # (m, m) [N s/m], with the diagonal delta, if a device has a matrix
+    Delta: Array | None  # (m, m) [N s/m] with the diagonal delta; None if no device has a damping matrix
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
-        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None."""
+        """Return the balance of held devices. Forces latch `late` (m,) [s] after ticks, or at ticks if it is None."""
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
             return Balance(delta / loop.T, Delta)
@@ -452,7 +456,7 @@ class Balance:
         return buffer.f[:count] * moved, self._spent(self.damping, moved)
 
     def _spent(self, damping: Array, moved: Array) -> Array:
-        """Return the least dissipation over steps (count, m, nsim); Delta is scaled to the diagonal `damping`."""
+        """Return the least dissipation over steps `moved` (count, m, nsim), by Delta scaled to the diagonal `damping`."""
         if self.Delta is None:
             return damping * moved**2
         return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)
@@ -460,9 +464,12 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class _LateBalance(Balance):
-    """The energy of each tick if forces latch within the tick, so that each period has two parts."""
+    """The energies of a tick in which forces latch later, so that the period has a part before and one after the latch.
 
-    before: Array  # (m, 1) [N/m] delta/latency until the latch, or 0 if it is at the tick; damping: delta/(T - latency)
+    `damping` is delta/(T - latency), for the part after the latch.
+    """
+
+    before: Array  # (m, 1) [N/m] delta/latency for the part before the latch; 0 if a force latches at the tick
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
@@ -474,7 +481,10 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces (ticks, outside) [N] for 10 ms or a longer tick: `size` on channel 1, -size/2 on 2, and so on."""
+    """Return forces (ticks, outside) [N] that act for 10 ms, or one tick if it is longer.
+
+    The force is `size` on channel 1, -size/2 on channel 2, size/3 on channel 3, and so on.
+    """
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):
@@ -491,9 +501,10 @@ def impulse_test(
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
 ) -> ImpulseTest:
-    """Simulate `ticks` periods with every set of humans after an impulse. `loops` are the exact closed loops.
+    """Simulate `ticks` periods with every set of humans after an impulse, and return the sums of the traces.
 
-    With walls the impulse is larger, to reach them, and growth is not measured.
+    `loops` are the exact closed loops. With walls the impulse is larger, so that hands reach the walls, and growth is
+    not measured.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, balance, ticks)
@@ -510,10 +521,10 @@ def impulse_test(
 def impulse_growth(
     process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int = 1
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return growth and clipping, (nsim,) each, after an impulse on every handle, for constant or varying timing.
+    """Return the growth [1/s] after an impulse on every handle, and whether a force was clipped, (nsim,) each.
 
-    `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
-    the second: inf where numbers overflow, -inf at exact rest.
+    `states` is the order of the plant. The growth compares the handles' speeds in the last quarter of the ticks with
+    those in the second quarter. It is inf where numbers overflow, and -inf for handles at exact rest.
     """
     T, quarter = process.F.T, ticks // 4
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
@@ -537,10 +548,10 @@ def verdict_within(growth: float, seconds: float) -> str | None:
 
 
 def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[float, float]:
-    """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers.
+    """Return the growth rate [1/s] of the exact linear loop after an impulse, and the duration [s] of its trace.
 
-    Modes that beat or decay one after the other hide a slow rate. Therefore the time is extended until it has SETTLED
-    time constants, to at most 100 s or `most` ticks.
+    Modes that beat or decay can hide a slow growth. Therefore the trace is extended until its duration is SETTLED time
+    constants of the rate, to at most 100 s or `most` ticks.
     """
     free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
@@ -596,7 +607,7 @@ class _Audit:
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)
         self._energy, self._least, self._size = np.zeros(nsim), np.zeros(nsim), np.zeros(nsim)
         self._across, self._weight, self._squares = np.zeros(nsim, dtype=complex), np.zeros(nsim), np.zeros(nsim)
-        self._half, self._first = ticks // 2, (self._across, self._weight)  # sums over the first half of the trace
+        self._half, self._first = ticks // 2, (self._across, self._weight)  # _first: sums over the trace's first half
 
     def see(self, buffer: StepBuffer, first: int, count: int) -> None:
         """Add the first `count` rows of the buffer to the sums; row 0 is tick `first`."""

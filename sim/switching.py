@@ -1,14 +1,15 @@
 """Varying delays: the loop as a switched system, its worst switching, and the certificates that cover it.
 
-The loop is linear, with one mode matrix for each set of ages of the forces in use. Its state is
-xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: the plant, the process block G (without Theta), and the forces g_i
-that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
+The age of a force is the number of ticks since the controller sent it. For given ages of the forces that the devices
+apply, a tick of the loop is a linear map, its mode matrix. The state is
+xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: the plant, the controller's block G (without the delays Theta), and
+the forces g_i that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
-[lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
-because a device holds its newest force. Candidates for the worst period are windows of this sequence that may be
-repeated, and constant delays at the ends of their ranges. The worst candidate has the product of mode matrices with the
-largest growth per tick; a spectral radius above 1 proves instability.
+[lo, hi] allow several forces; each device receives that force which gives it the most power -f v. An age grows by
+at most one per tick, because a device holds its newest force. Candidates for the worst period are windows of this
+sequence that may be repeated, and constant delays at the ends of their ranges. Of all candidates, the product of mode
+matrices of the worst one grows fastest per tick. A spectral radius of this product above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, unstable
 
-_SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
+_SEARCHED = 1600  # number of ticks of greedy switching, in which the worst period is searched
 _LONGEST_PERIOD = 250  # [ticks] largest length of a searched window
 _STARTS = 6  # number of windows of the greedy sequence
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
@@ -49,10 +50,10 @@ _STREAM = 5  # random stream of the delays, independent of the humans' stream wi
 class Period:
     """Periodic switching with the exact growth of the loop."""
 
-    ages: Ticks  # (period, m) ages of the forces in use [samples]
-    delays: Ticks  # (period, m) delays of packets that produce these ages
+    ages: Ticks  # (period, m) ages [samples] of the forces that the devices apply
+    delays: Ticks  # (period, m) delays [samples] of packets that produce these ages
     growth: float  # [1/s] growth over one period
-    spectral_radius: float  # spectral radius of the product over one period
+    spectral_radius: float  # spectral radius of the product of mode matrices over one period
 
 
 # ---- one run
@@ -76,7 +77,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
-    """Draw the delays (ticks, m) of run `index`; `recorded` are adversarial delays."""
+    """Return the delays (ticks, m) of run `index`: adversarial ones if `recorded` has them, otherwise random ones."""
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else recorded
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
@@ -88,7 +89,7 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded
 
 
 def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
-    """Return A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
+    """Return A of xi[k+1] = A xi[k] while the forces have these ages [samples]; `depth` has the largest ages."""
     states, m = plant.A.shape[0], G.outputs
     n, first = states + G.order + sum(depth), states + G.order
     sent = np.zeros((m, n))
@@ -143,7 +144,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
 
 
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
-    """Return the fastest growing repetition of a window of `ages` (ticks, m), or of constant delays lo or hi."""
+    """Return the period that grows fastest if it repeats: a window of `ages` (ticks, m), or constant delays lo or hi."""
     ticks = ages.shape[0]
     matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
@@ -178,7 +179,7 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 
 # ---- many humans in one batch, each under different varying delays
 
-_SHORTEST_CROWD = 2.0  # [s] least duration of a trace; in a shorter one the spreading impulse hides a growth of 1 1/s
+_SHORTEST_CROWD = 2.0  # [s] least duration of a trace; in less time the spreading impulse hides a growth of 1 1/s
 _LONGER = 5  # duration of the second trace of slow hands, relative to the first
 
 
@@ -187,7 +188,7 @@ class Switched:
     """The growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
     exact: Array  # growth of the linear loop
-    mujoco: Array  # growth of the other engine's trace; nan without that engine, or if a force reached its limit
+    mujoco: Array  # growth on the second engine's trace; nan without that engine, or if a force reached its limit
 
 
 def switched_crowd(
@@ -198,11 +199,11 @@ def switched_crowd(
     duration: float,
     other: Callable[[NDArray[np.intp], str, Timing | None], Engine] | None,
 ) -> Switched:
-    """Run the impulse test for every set of humans, each under the delays of its index.
+    """Return the growth after an impulse for every set of humans, each under the delays of its index.
 
-    Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other(sets, integrator, timing)` makes the second engine. Sets whose rate is too slow for the
-    duration run longer; if the sign changes, the longer traces of both engines count.
+    The delays of a set depend on (seed, index) and the loop only. Varying periods and latencies depend on the seed, and
+    are the same for all sets. `other(sets, integrator, timing)` makes the second engine. A set whose rate is too slow
+    for the duration runs longer. If the sign of the rate then changes, the longer traces of both engines count.
     """
     scenario, scene = simulation.scenario, held_by.scene
 
@@ -260,13 +261,13 @@ class DelaysCovered:
     """Whether a certificate covers the delays of a scenario, and the damping that switching requires."""
 
     covered: bool
-    covers: str  # words that say which delays are covered, or that none are
+    covers: str  # words on the delays that are covered, or that no delays are covered
     switching: SwitchingFigures | None = off_table(default=None)
-    on_file: DelayRange | None = None  # range for which the file proves any switching; None unless it covers these
+    on_file: DelayRange | None = None  # delays for which the coupling's file proves any switching, if it covers these
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:
-        """Examine the coupling; `on_file` is the range of delays for which its file proves any switching."""
+        """Return which delays the coupling covers; for those in `on_file`, its file proves any switching."""
         constant_delays = (need for name, need in assessment.requirements.items() if name != SWITCHING.name)
         certified = any(need.certified for need in constant_delays)
         varying, span = scenario.varying_delay, scenario.delay_range
@@ -298,7 +299,7 @@ class DelaysCovered:
 
 
 def _how_proved(figures: SwitchingFigures, on_file: DelayRange | None) -> str:
-    """Name the evidence that any switching within the range is safe; "" if there is none."""
+    """Return the evidence that any switching within the range is safe, in words; "" if there is none."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"
     if not figures.requirement.certified:

@@ -46,7 +46,7 @@ def _real(name: str, values: NDArray[Any]) -> Array:
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Return whether a value is a read-only float array, which needs no copy."""
+    """Return whether a value is a read-only float array of `ndim` dimensions, which needs no copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
@@ -60,15 +60,15 @@ class Trace(ReadOnly):
     Attributes:
         t: (N,) times [s] at which the ticks begin; k T if all periods are T.
         x: (N, m) displacements of the devices as the encoders gave them [m].
-        f: (N, m) forces fed back, within the limits [N]; the devices feel -f.
+        f: (N, m) forces that are fed back within the limits [N]; the devices feel -f.
         x_handle: (N, m) displacements of the handles [m].
         v_handle: (N, m) velocities of the handles [m/s].
-        w: (N, outside) external forces [N], voluntary or of a tap.
+        w: (N, outside) external forces [N]: voluntary forces and those of a tap.
         meta: Settings and verdicts of the run, as in its JSON.
         z: (N, order) states of the controller.
         s: (N, states) states of the plant: positions [m], velocities [m/s], states of the hands' impedances, and with
             latencies the held forces [N].
-        diverged: Whether the next tick has numbers that are not finite, or the engine gave up in the last 2048 ticks.
+        diverged: Whether the tick after the last one has numbers that are not finite, or the engine reported trouble.
         interrupted: Whether the run was stopped from the keyboard.
         net: The passivity layer between controller and devices, in its final state; None without one.
         names: (m,) names of the channels if devices have several axes; empty if channels are numbered.
@@ -110,16 +110,22 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached `force_limit` (m,) [N], which bounds the vector length in each ball."""
+        """Return (N,) whether a force reached its limit `force_limit` (m,) [N].
+
+        For the channels of a ball the limit is that of the length of their force vector.
+        """
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
-        """Return the number of ticks before the first clipped one; without a clipped tick, the number of all ticks."""
+        """Return the number of ticks before the first clipped force; without a clipped force, that of all ticks."""
         clipped = self.clipped(force_limit, balls)
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the forces' strongest frequency from 10 Hz up, in the last quarter; None for a short or calm trace."""
+        """Return the strongest frequency [Hz], from 10 Hz up, of the forces in the last quarter of the trace.
+
+        Return None for a trace with fewer than 256 ticks, or without such a frequency.
+        """
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -135,7 +141,7 @@ class Trace(ReadOnly):
         return Signals(self.t, self.x, self.f, self.x_handle, self.names)
 
     def to_frame(self) -> Any:
-        """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]", "f1 [N]" or "x left.y [m]".
+        """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]" or, for y, "f left.y [N]".
 
         Raises:
             ImportError: pandas is not installed.
@@ -159,7 +165,7 @@ class Trace(ReadOnly):
             title: The title; default: the name of the scenario with the verdict.
 
         Raises:
-            InputError: Another suffix, or the file cannot be written.
+            InputError: The path has another suffix, or the file cannot be written.
         """
         from haptic_loop.sim.plots import draw_run, relabel, save
 
@@ -182,7 +188,10 @@ class Trace(ReadOnly):
         return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
 
     def save_npz(self, path: Path) -> Path:
-        """Write `arrays` to an .npz file without pickle, uncompressed (compression would save only a tenth)."""
+        """Write `arrays` to an .npz file without pickle, and return its path.
+
+        The file is not compressed, because compression would save only a tenth.
+        """
 
         def content(file: BinaryIO) -> None:
             np.savez(file, allow_pickle=False, **self.arrays)
@@ -191,12 +200,12 @@ class Trace(ReadOnly):
 
     @classmethod
     def load_npz(cls, path: Path) -> Self:
-        """Read a trace that `save_npz` wrote. Raises InputError for any other file."""
+        """Return a trace that `save_npz` wrote. Raises InputError for any other file."""
         return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Build a trace from the arrays of its file. Raises InputError if they are no trace."""
+        """Return the trace with the arrays of its file. Raises InputError if the arrays are no trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             names = tuple(str(name) for name in arrays.get("names", np.zeros(0)))
@@ -224,9 +233,9 @@ class Trace(ReadOnly):
 
 # ---- octaves, and lasting oscillations
 
-_PERIODS = 4  # least number of periods of an octave in a window; with fewer the window mixes neighbouring octaves
-_TREND = 7  # degree of the subtracted polynomial, which leaves 1 um of a motion of 15 mm at 0.6 Hz in 1 s
-SUSTAINED = 0.95  # least ratio of a lasting oscillation's amplitude in the last window to that in the first
+_PERIODS = 4  # least number of periods in a window; with fewer periods the window mixes neighbouring octaves
+_TREND = 7  # degree of the polynomial of the slow motion; in 1 s it leaves 1 um of a motion of 15 mm at 0.6 Hz
+SUSTAINED = 0.95  # least ratio of amplitudes, last window over first window, of an oscillation that lasts
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
@@ -235,8 +244,8 @@ class Oscillation:
     """The strongest oscillation of positions, with one entry per simulation."""
 
     sustained: NDArray[np.bool_]  # (nsim,) whether the oscillation lasts
-    amplitude: Array  # (nsim,) [m] amplitude of the strongest octave, of a lasting one if there is any; inf: diverged
-    frequency_hz: Array  # (nsim,) [Hz] frequency of the strongest line in the same octave; nan: diverged
+    amplitude: Array  # (nsim,) [m] of the strongest octave; only lasting ones count if there are any; inf: diverged
+    frequency_hz: Array  # (nsim,) [Hz] of the strongest line in the octave of `amplitude`; nan: diverged
 
 
 def slowest_seen(duration: float) -> float:
@@ -245,7 +254,10 @@ def slowest_seen(duration: float) -> float:
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Judge positions x (ticks, m, nsim) [m], the second half of traces; `threshold` [m] is the least amplitude."""
+    """Return the strongest oscillation of positions x (ticks, m, nsim) [m], which are the second half of traces.
+
+    An oscillation lasts only if its amplitude exceeds `threshold` [m].
+    """
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
@@ -264,10 +276,11 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
 
 
 def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
-    """Split x (ticks, m, nsim), less its slow part, into octaves.
+    """Split positions x (ticks, m, nsim) into octaves, after subtracting the slow motion.
 
-    Returns each octave's amplitude (that of a sinusoid of equal power), the frequency [Hz] of its strongest line, both
-    (octaves, m, nsim), and its share of all lines, (octaves,).
+    Returns:
+        The amplitude of each octave, (octaves, m, nsim), which is that of a sinusoid of equal power; the frequency [Hz]
+        of its strongest line, (octaves, m, nsim); and its share of all lines of the spectrum, (octaves,).
     """
     ticks = x.shape[0]
     window = np.hanning(ticks)
@@ -298,7 +311,7 @@ _WINDOWS = 7  # least number of windows, each of which overlaps the next by half
 _NEEDED = 4  # consecutive windows in which an oscillation must be seen
 _SHORTEST = 200  # ticks that a growth rate needs
 _FLOOR = 3.0  # an oscillation must exceed this multiple of the encoders' rounding in its octave
-_CLEAR = 4.0  # standard errors by which a slope must differ from zero, because a line may have only four points
+_CLEAR = 4.0  # number of standard errors by which a clear slope differs from 0; a line may have only four points
 _FARTHEST = 1e100  # [m] the square of a larger number may overflow
 _EVEN = 1e-3  # largest relative difference between periods of a trace
 _FINEST = 1e-9  # [m] step that is assumed for an ideal encoder
@@ -315,11 +328,11 @@ class Growth:
     frequency_hz: float | None = None
     amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
     slowest_hz: float | None = None  # frequency below which oscillations are not seen
-    trend: str | None = None  # "grows" or "decays", by more than _CLEAR standard errors, or "neither"
+    trend: str | None = None  # "grows" or "decays" if the rate exceeds _CLEAR standard errors, otherwise "neither"
     reason: str | None = None  # why there is no rate
 
     def words(self, T: float) -> str:
-        """Describe the growth in one line, for ticks of T [s]."""
+        """Return the growth in one line of words, for ticks of T [s]."""
         where = f"ticks {self.first} to {self.stop} ({(self.stop - self.first) * T:.7g} s)"
         above = "" if self.slowest_hz is None else f" (from {self.slowest_hz:.3g} Hz up)"
         if self.reason or self.amplitude_m is None:
@@ -329,11 +342,11 @@ class Growth:
 
 
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
-    """Measure how fast displacements x (N, m) [m] grow, sampled every T [s] by encoders of steps (m,) [m].
+    """Return how fast displacements x (N, m) [m] grow, sampled every T [s] by encoders of steps (m,) [m].
 
-    The second half of x is examined first. If no oscillation is seen there for long enough, the last quarter is
-    examined, and so on, because a fast growing mode may appear late. The strongest growing octave is reported, or the
-    strongest octave if none grows. `first` is the number of the first tick.
+    The second half of x is examined first. A mode that grows fast may appear late. Therefore, if no oscillation is seen
+    in this half for long enough, the last quarter is examined, and so on. The result is that of the strongest octave
+    that grows, or of the strongest octave if none grows. `first` is the number of the first tick.
     """
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:
@@ -362,8 +375,8 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
 class _Lines(NamedTuple):
     """The oscillations in a part of a trace."""
 
-    octaves: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m] of each
-    brief: bool  # an oscillation is seen in some window; in too few windows for a rate if `octaves` is empty
+    octaves: list[tuple[float, float, float, float]]  # rate [1/s], its error [1/s], frequency [Hz] and amplitude [m]
+    brief: bool  # an oscillation is seen in some window; if `octaves` is empty, in too few windows for a rate
     gone: bool  # no oscillation is seen in the last window
     floor: float  # [m] least amplitude that is above the encoders' rounding in every octave
     slowest: float  # [Hz] frequency below which oscillations are not seen
@@ -394,7 +407,7 @@ def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def _slope(values: Array, spacing: float) -> tuple[float, float]:
-    """Fit a line through values `spacing` seconds apart; return slope and standard error [1/s]."""
+    """Return the slope [1/s] of a line through values that are `spacing` seconds apart, and its standard error."""
     n = len(values)
     t = spacing * (np.arange(n) - (n - 1) / 2)
     slope = float(t @ values / (t @ t))
@@ -403,10 +416,10 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 
 
 def growths(trace: Trace) -> list[Growth]:
-    """Measure the growth in each part of a trace in which the loop was linear (`run.steady_ticks` of its metadata).
+    """Return the growth in each part of a trace in which the loop was linear.
 
-    Without this entry the trace is one part. Raises InputError for wrong parts, and for samples that are not finite and
-    evenly spaced.
+    The entry `run.steady_ticks` of the metadata has these parts; without it the whole trace is one part. Raises
+    InputError for wrong parts, and for samples that are not finite or not evenly spaced.
     """
     n, m = trace.x.shape
     run = trace.meta.get("run") if isinstance(trace.meta, dict) else None
