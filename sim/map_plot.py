@@ -1,4 +1,4 @@
-"""The picture of the K-B plane: edges of certificates, cells that random humans decide, and simulated points."""
+"""The picture of a Z-width map: edges of certificates, cells that random humans decide, and simulated points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # colours of areas
 
-#: lines in the order of drawing; a dashed line may coincide with the solid line before it, and then both are visible
+#: lines in the order of drawing; if a dashed line lies on the solid line before it, both are visible
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
@@ -34,7 +34,10 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
-    """Plot stiffness over damping: cells for the population, lines for certificates' edges, symbols for MuJoCo."""
+    """Plot stiffness over damping, and return the path of the picture.
+
+    Cells show the population, lines the edges of certificates, and symbols the runs in MuJoCo.
+    """
     figure = Figure((8, 5.6), layout="constrained")
     axes = figure.subplots()
     about_environment = report.fixed is not None
@@ -78,7 +81,7 @@ def _edges(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
-        # On the edge the required damping is 1 - GUARD of the available one; `clip` keeps values far from it finite.
+        # On the edge, required over available damping is 1 - GUARD. Larger ratios are cut so that they are finite.
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:
@@ -101,7 +104,7 @@ def _side(ratio: Array, drawn: Map, report: MapReport) -> str:
 
 
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
-    """Draw the contact springs of the scenario's environment that lie on the map, and return the legend's entry."""
+    """Draw the contact springs of the scenario's environment that lie on the map; return the entry of the legend."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
     shown = [(s.B, s.K) for s in report.fixed.contact_springs] if report.fixed else []
     for b, k in shown:

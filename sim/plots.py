@@ -1,4 +1,4 @@
-"""Pictures that commands write, in one style: readable in black and white and by the colour-blind.
+"""Pictures that commands write, in one style that is readable in black and white and by the colour-blind.
 
 A function plot_.. writes one picture and returns its path; a function draw_.. returns its figure.
 """
@@ -50,7 +50,7 @@ _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "
 def _panels(
     title: str, rows: int, columns: int, size: tuple[float, float], layout: Any = "constrained", **shared: Any
 ) -> tuple[Figure, Any]:
-    """Make a figure of `size` [inch] with a title, and its axes (rows, columns), each with a grid."""
+    """Return a figure of `size` [inch] with a title, and its axes (rows, columns), each with grid lines."""
     figure = Figure(size, layout=layout)
     axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for axis in axes.flat:
@@ -60,7 +60,10 @@ def _panels(
 
 
 def _arrange(figure: Figure, axes: Any) -> None:
-    """Make room for the labels of the axes (rows, columns) and the legend, in half of the constrained layout's time."""
+    """Make room for the labels of the axes (rows, columns) and for the legend.
+
+    This takes half of the time of matplotlib's constrained layout.
+    """
     renderer, (width, height) = FigureCanvasAgg(figure).get_renderer(), figure.get_size_inches()
 
     def room(axis: Any, side: int) -> float:
@@ -108,7 +111,7 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 
 
 def _texts(figure: Figure) -> list[Text]:
-    """Return all texts but tick labels; findobj would create all ticks, which is slow."""
+    """Return all texts but tick labels. Unlike `findobj`, this does not create all ticks, which is slow."""
     texts = list(figure.texts)
     for axis in figure.axes:
         texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
@@ -118,10 +121,10 @@ def _texts(figure: Figure) -> list[Text]:
 
 
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Write the figure atomically in the format of the suffix; only tick labels are parsed as formulas.
+    """Write the figure in the format of the suffix, and return its path. Only tick labels may contain formulas.
 
-    A .png is for the screen. A .pdf or .svg is for a paper: at most as wide as a page of two columns, with letters that
-    are readable at that width.
+    A .png is for the screen. A .pdf or .svg is for a paper: it is at most as wide as a page with two columns, and has
+    letters that are readable at this width.
 
     Raises:
         InputError: The suffix is none of .png, .pdf and .svg, or the file cannot be written.
@@ -139,20 +142,20 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
 
 
 def png(figure: Figure, dpi: int = 130) -> bytes:
-    """Return the figure as the content of a PNG file; only tick labels are parsed as formulas."""
+    """Return the content of a PNG file of the figure. Only tick labels may contain formulas."""
     _literal(figure)
     relabel(figure)
     figure.set_dpi(dpi)
     content, canvas = BytesIO(), FigureCanvasAgg(figure)
-    canvas.draw()  # savefig would draw a figure with a layout twice.
+    canvas.draw()  # `savefig` would draw a figure twice if it has a layout.
     # Every pixel is opaque. Without opacity and with compression 1, a file takes half the time and is 6 % smaller.
     opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     opaque.save(content, "png", compress_level=1, dpi=(dpi, dpi))
     return content.getvalue()
 
 
-_PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
-_LEGEND = 0.8  # legend columns per entry, for a figure that is not shrunk
+_PAGE = 7.16  # [inch] width of both columns of an IEEE page; other papers with two columns are nearly as wide
+_LEGEND = 0.8  # number of legend columns per entry in a figure that is not shrunk
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
@@ -172,7 +175,7 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Show all texts but tick labels literally: no formulas, and a replacement for characters that the font lacks."""
+    """Show all texts but tick labels without formulas, and replace characters that the font lacks."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
     for text in _texts(figure):
         text.set_parse_math(False)
@@ -189,7 +192,7 @@ def _plain_numbers(axes: Any) -> None:
 
 # ---- runs, as in the paper's Figures 5 and 6
 
-_SAME = 1e-6  # [%] a smaller force error is rounding: the commanded force equals that of the object itself
+_SAME = 1e-6  # [%] A smaller force error is rounding, so the commanded force equals that of the object itself.
 
 
 def draw_run(
@@ -200,15 +203,15 @@ def draw_run(
     onset: Onset | None = None,
     around: Contacts | None = None,
 ) -> Figure:
-    """Draw displacements and forces of a run, with a zoom where the forces turn most sharply.
+    """Return a figure of displacements and forces of a run, with a zoom where the forces turn most sharply.
 
     Args:
-        result: The run.
+        result: The signals of the run.
         title: The title of the figure.
-        frequency_hz: The frequency of the oscillation, by which the zoom and the windows of amplitudes are chosen.
-        ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
-        onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
-            its prediction replace the zoom of the displacements.
+        frequency_hz: The frequency of the oscillation, for the widths of the zoom and of the windows of amplitudes.
+        ideal: Forces (N, m) [N] of the ideal environment, drawn behind the forces of the run, and the force error [%].
+        onset: The part of the run that is not credible, which is drawn in grey. If the loop grows, the amplitude of the
+            oscillation and its prediction replace the zoom of the displacements.
         around: Names of the curves, and walls.
     """
     growth, around = onset.growth if onset else None, around or Contacts(result.names)
@@ -241,9 +244,10 @@ def draw_run(
 
 
 def _shown_parts(result: Signals, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
-    """Return slices of ticks: the whole run, and the zoom if the loop grows or the forces stand out there.
+    """Return slices of ticks: that of the whole run and, if there is a zoom, that of the zoom.
 
-    The zoom lies within the credible limits and, if the loop grows, before the first clipped tick.
+    There is a zoom if the loop grows, or if the forces turn far more sharply there than elsewhere. The zoom ends before
+    the run leaves the credible limits and, if the loop grows, before the first clipped force.
     """
     last, grows = result.t.size, onset is not None and onset.growth is not None
     if onset and onset.until is not None:
@@ -255,7 +259,7 @@ def _shown_parts(result: Signals, frequency_hz: float, onset: Onset | None) -> t
 
 
 def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
-    """Order curves channel by channel, the handle first."""
+    """Return the curves of the legend channel by channel; those of handles come first."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
     def place(label: str) -> tuple[int, bool, str]:
@@ -275,11 +279,11 @@ def _calmest_last(values: Array) -> list[int]:
     return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
 
 
-_ALIKE = 0.005  # curves that differ by less, relative to the largest value, look the same
+_ALIKE = 0.005  # Two curves look the same if their difference is smaller, relative to the largest value.
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return a label suffix for each column of `values` (N, m): which earlier curve looks the same, or ""."""
+    """Return a label suffix for each column of `values` (N, m), which names an earlier curve that looks the same."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -288,7 +292,7 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
     return ends
 
 
-_SHARPER = 4.0  # a zoom's least mean square of the forces' second differences, relative to that of the run
+_SHARPER = 4.0  # least ratio, zoom over whole run, of the mean square of the forces' second differences
 
 
 def _stands_out(result: Signals, near: slice, ticks: int) -> bool:
@@ -300,7 +304,7 @@ def _stands_out(result: Signals, near: slice, ticks: int) -> bool:
 
 
 def _one_point(result: Signals) -> str:
-    """Return the label of the displacement axis if one curve shows both the handle and the encoder."""
+    """Return the label of the displacement axis for curves that show handle and encoder at once."""
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
@@ -321,7 +325,7 @@ def _draw_walls(axes: Array, result: Signals, around: Contacts) -> None:
 
 
 def _draw_displacements(axes: Array, result: Signals, parts: tuple[slice, ...], around: Contacts) -> None:
-    """Draw handles over encoders, in millimetres; only handles if both look the same in the picture."""
+    """Draw encoders and, over them, handles [mm]; if both look the same in the picture, draw only handles."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
@@ -340,7 +344,7 @@ def _draw_displacements(axes: Array, result: Signals, parts: tuple[slice, ...], 
 
 
 def _draw_forces(axes: Array, result: Signals, parts: tuple[slice, ...], around: Contacts) -> None:
-    """Draw the forces; calm curves are drawn last, so that agitated ones do not hide them."""
+    """Draw the forces. Calm curves are drawn last, so that no agitated curve hides them."""
     two, alike = _two_points(result), _coinciding(result.f, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.f):
@@ -384,16 +388,16 @@ def _draw_onset(axis: Axes, result: Signals, hertz: float, onset: Onset, around:
 
 
 def _amplitudes(result: Signals, hertz: float, ticks: int) -> tuple[Array, Array]:
-    """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, in windows of 12 periods.
+    """Return times (k,) [s] and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`.
 
-    Both arrays are empty if `ticks` is less than two windows.
+    A window has 12 periods. Both arrays are empty if `ticks` is less than two windows.
     """
     T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
     width = max(8, round(12 / (max(hertz, 1.0) * T)))
     if ticks < 2 * width:
         return np.empty(0), np.empty((0, result.x.shape[1]))
     window, starts = np.hanning(width), np.arange(0, ticks - width, max(1, width // 4))
-    # The second difference removes a hand's slow motion, and scales a sinusoid by a known factor.
+    # The second difference removes a hand's slow motion. It multiplies the oscillation by `factor`.
     fast = np.diff(result.x[:ticks], n=2, axis=0, prepend=result.x[:1], append=result.x[ticks - 1 : ticks])
     turning = window * np.exp(-2j * np.pi * hertz * T * np.arange(width))
     sums = np.array([turning @ fast[k : k + width] for k in starts])
@@ -402,7 +406,7 @@ def _amplitudes(result: Signals, hertz: float, ticks: int) -> tuple[Array, Array
 
 
 def _draw_ideal(axes: Array, result: Signals, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
-    """Draw the ideal forces, broad and pale, and cut them at three times the largest other force."""
+    """Draw the ideal forces broad and pale, and cut them off at three times the largest force of the run."""
     forces, percent = ideal
     label = "pale: the force of the object itself for this motion"
     if percent is not None:
@@ -452,9 +456,10 @@ class Panel:
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
-    """Plot the forces of several couplings on equal axes, one panel each; pale curves are the object's own forces.
+    """Plot the forces of several couplings on equal axes, with a panel for each coupling.
 
-    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is), and cut off larger forces.
+    Pale curves are the object's own forces. The axes reach to 1.5 times the largest ideal force of the credible runs
+    (of all runs if none is credible), and cut off larger forces.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
@@ -508,7 +513,7 @@ def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
 
 
 def draw_population(mass: Array, damping: Array, growth: Array, title: str) -> Figure:
-    """Draw growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,)."""
+    """Return a figure of growth rates (n,) [1/s] over masses (n,) [kg] and least dampings (n,) [N s/m] of hands."""
     figure, axes = _panels(title, 1, 2, (10, 4.2), sharey=True)
     kinds = (("stable", growth <= 0, "o", STYLES[0]), ("unstable", growth > 0, "^", STYLES[1]))
     labels = "mass of the human [kg]", "least damping of the human [N s/m]"
@@ -538,7 +543,7 @@ _FLOOR = 1e-4  # smallest value on a logarithmic axis, relative to the largest
 
 
 def plot_singular_values(report: Comparison, path: Path) -> Path:
-    """Plot all singular values of E, F and the mismatch M, one panel per coupling; smaller values have thin lines."""
+    """Plot all singular values of E, F and the mismatch M, one panel per coupling; thinner lines are smaller values."""
     couplings = report.couplings
     figure, axes = _over_frequency("singular values", 1, len(couplings), (4.2, 4.2))
     hz = report.frequency_hz
@@ -567,7 +572,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping
-    alike = len(set(available)) == 1  # With unequal dampings the curves are ratios.
+    alike = len(set(available)) == 1  # If devices have different dampings, the curves are ratios.
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
     for axis, condition in zip(axes[0], names, strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
@@ -593,7 +598,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
 
 
 def plot_perceived(report: Comparison, path: Path) -> Path:
-    """Plot the effective impedance of each channel as a stiffness and a damping, beside those of E itself."""
+    """Plot the stiffness and the damping that each user feels, beside those of E itself."""
     title = "felt by each user, the other devices held still; vertical axes are linear near zero"
     figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
     hz = report.frequency_hz
@@ -619,5 +624,5 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
 
 
 def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
-    """Make panels of `size` [inch] each; the figure is wide enough for the title."""
+    """Return a figure that is wide enough for its title, and its axes: panels of `size` [inch] each."""
     return _panels(title, rows, columns, (max(columns * size[0], 5.5), rows * size[1] + 0.6), sharex=True)

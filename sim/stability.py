@@ -456,7 +456,7 @@ class Balance:
         return buffer.f[:count] * moved, self._spent(self.damping, moved)
 
     def _spent(self, damping: Array, moved: Array) -> Array:
-        """Return the least dissipation over steps `moved` (count, m, nsim), by Delta scaled to the diagonal `damping`."""
+        """Return the least dissipation for steps `moved` (count, m, nsim). `damping` is the diagonal of the matrix."""
         if self.Delta is None:
             return damping * moved**2
         return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)

@@ -144,7 +144,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
 
 
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
-    """Return the period that grows fastest if it repeats: a window of `ages` (ticks, m), or constant delays lo or hi."""
+    """Return the period that grows fastest if it repeats: part of `ages` (ticks, m), or constant delays lo or hi."""
     ticks = ages.shape[0]
     matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]

@@ -1,4 +1,4 @@
-"""Parts of the report of a validation: figures, and the text of their rows."""
+"""Parts of the report of a validation: their figures, and the texts of their rows."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
 from haptic_loop.sim.stability import unstable
 
-_SETTLING = 4  # least duration of a trace whose handles must slow down, in decay times of the slowest mode
-_ROUNDING = 1e-9  # allowed negative energy W(N) (sim.crowds), relative to the magnitudes of its terms
+_SETTLING = 4  # duration of a trace, in decay times of the slowest mode, from which its handles must slow down
+_ROUNDING = 1e-9  # size of an energy W(N) < 0 (sim.crowds) that is rounding, relative to the sizes of its terms
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Unstable:
     exact: int
     mujoco: int | None
     own: int | None = off_table("if given", None)  # number by a user's own engine
-    others: str = off_table("left out", "")  # the other engine's count and name
+    others: str = off_table("left out", "")  # number and name of the second engine, in words
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
-        """Return the record of two counts; `other` is that of the engine that is compared with the exact one."""
+        """Return the record of two counts: of the exact engine, and of the second engine (`other`)."""
         if other is None or question.engine == "exact":
             return cls(exact, None)
         if isinstance(question.engine, str):
@@ -69,7 +69,7 @@ class EnvironmentsMet:
 
 
 def disagreement_words(question: Validation, findings: Findings) -> str:
-    """Return the number of disagreements; for three, also the rates of both engines and a command to repeat them."""
+    """Return the number of disagreements in words; three of them with both engines' rates and a command to repeat."""
     engine = "MuJoCo" if isinstance(question.engine, str) else engine_name(question.engine)
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
@@ -155,10 +155,10 @@ class Traces:
     measured: int  # number of traces with a growth rate
     witnessed: int  # number of traces that MuJoCo, or a user's own engine, also made
     undecided: int  # number of traces too short for the sign of their rate; eigenvalues decide there
-    largest_difference_per_s: float | None  # largest difference of the growth rates of trace and exact loop
-    stable_and_settling: int  # number of stable loops whose handles were slower in the last quarter than in the second
+    largest_difference_per_s: float | None  # largest difference of growth rates between a trace and its exact loop
+    stable_and_settling: int  # number of stable loops with slower handles in the last quarter than in the second one
     stable: int
-    slowest_settling: float | None  # largest ratio of late to early speeds of handles among the stable loops
+    slowest_settling: float | None  # largest ratio of late to early speeds of the handles of a stable loop
     slowest_decay_s: float | None  # decay time of the slowest mode that decays
     settling_decides: bool  # whether the traces are long enough for handles to slow down
     reason: str | None = off_table("if given", None)
@@ -201,7 +201,10 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Test that W(N) >= 0 (sim.crowds) on traces; traces with clipped forces are left out, unless a limiter clips."""
+    """Result of the test that W(N) >= 0 (sim.crowds) on traces.
+
+    Traces with clipped forces are left out, but not traces on which a limiter acts.
+    """
 
     audited: int  # number of tested traces
     clipped: int  # number of traces that are left out
@@ -226,13 +229,16 @@ _Met = TypeVar("_Met")  # delays or ticks
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """The number of humans with whom the loop grows while delays or ticks vary; if `covered`, it must be 0."""
+    """The number of sets of humans with whom the loop grows while delays or ticks vary.
+
+    This number must be 0 if certificates cover the variation (`covered`).
+    """
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # whether certificates cover the variation
     unstable: Unstable = off_table()
     humans: int = off_table()  # number of sets of humans whose growth was computed
-    mujoco_unclipped: int = off_table()  # number of MuJoCo's traces in which no force was clipped
+    mujoco_unclipped: int = off_table()  # number of the second engine's traces in which no force was clipped
     largest_growth_per_s: float | None = off_table()
     worst_index: int | None = off_table()
     holds: bool = off_table()

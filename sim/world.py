@@ -45,9 +45,9 @@ class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
     given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
-    port_least_J: float  # least energy that had entered at a tick: sums of f'(u[k] - u[k-1]) with contact positions u
+    port_least_J: float  # least energy at any tick that had entered: sum of f'(u[k] - u[k-1]), contact positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
-    created_J: float  # bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
+    created_J: float  # bound on the energy that constraints created (the lemma on MuJoCo worlds in docs/theory.md)
     unsettled_steps: int  # number of steps whose limited forces did not settle in the allowed repetitions
     warnings: list[str]  # texts of MuJoCo's warnings
 
@@ -82,7 +82,7 @@ class SceneRecord:
 
     file: str
     settings: str  # options that this program sets in the scene
-    parts: list[dict[str, object]]  # kinds of parts, their number, and the bound on the energy that they generate
+    parts: list[dict[str, object]]  # for each kind of part its number, and a bound on the energy that it generates
     active: list[str]  # actuators, plugins and callbacks, which the lemma in docs/theory.md does not cover
 
     @classmethod
@@ -102,9 +102,11 @@ class Claim:
 
     @classmethod
     def of(cls, assessment: Assessment, certified_for: Network | None = None, ran: WorldRecord | None = None) -> Claim:
-        """Return the claim of the assessed run; without a guarantee it names the network `certified_for`, if any.
+        """Return the claim of the assessed run.
 
-        After the run, `ran` adds W0 and the released energy. If the scene diverged, there is no guarantee.
+        Without a guarantee, the claim names the network `certified_for` for which the coupling is certified, if any.
+        The record `ran` of a finished run adds the sum of W0 and the released energy. If its scene diverged, there is
+        no guarantee.
         """
         guarantee = assessment.guarantee
         if ran and ran.diverged:
@@ -137,8 +139,8 @@ def _energy(joules: float) -> str:
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError if the coupling has no V, if its direct part D_V couples devices or is not symmetric and positive
-    definite, and if the scene is invalid or has changed since the scenario was loaded.
+    D_V is the direct part of the coupling's compliance V. Raises InputError if there is no V, if D_V couples devices or
+    is not symmetric and positive definite, or if the scene is invalid or has changed since the scenario was loaded.
     """
     world = scenario.environment.world
     assert world is not None
@@ -198,17 +200,17 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
     return [np.linalg.inv((D + D.T) / 2) for D in within]
 
 
-# ---- the net of a run
+# ---- the passivity layer of a run
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """Settings of a net (sim.passivity_layer): the scenario's world behind coupling and energy shell."""
+    """Settings of a passivity layer (sim.passivity_layer): the scenario's world behind coupling and energy shell."""
 
     start: float = START_J  # W0 [J]
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> InWorld:
-        """Return a new net for `nsim` runs. Raises InputError if the loop cannot contain a world."""
+        """Return a new passivity layer for `nsim` runs. Raises InputError if the loop cannot contain a world."""
         scene = scene_of(simulation.scenario, simulation.coupling)
         if any(simulation.scenario.psi):
             raise InputError("psi: a world answers within the tick, so psi must be 0")
@@ -223,7 +225,7 @@ class Touched:
 
 
 def live(simulation: Simulation) -> Simulation:
-    """Return the simulation with a net that simulates its world and delays the forces; runs may have any length."""
+    """Return the simulation with a passivity layer for its world that also delays forces; runs may have any length."""
     touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:
@@ -254,10 +256,10 @@ class Late:
 
 
 class InWorld:
-    """The net of a world: the world behind its shell, and the energy that hands and devices received."""
+    """The passivity layer of a world: the world behind its shell, and the energy that hands and devices received."""
 
     def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
-        """`damping` (m, m) [N/m] is Delta over the longest period: devices dissipate at least dx' damping dx a tick."""
+        """`damping` (m, m) [N/m] is Delta over the longest period; a tick dissipates dx' damping dx or more."""
         self.ports, self._shell, self._damping = ports, shell, damping
         m, nsim = len(damping), len(ports)
         self._x: Array | None = None
@@ -330,9 +332,10 @@ def thrown(
     start: float = START_J,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[HandsInWorld]:
-    """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
+    """Simulate sets of hands of the scenario's population for `duration` [s], and return their energies.
 
-    The chains of the sets with odd numbers have no dampers. `start` is W0 [J].
+    All bodies of hands and devices begin with random speeds. In sets with odd numbers, chains have no dampers. `start`
+    is W0 [J].
     """
     from haptic_loop.sim.crowds import Validation
 
@@ -360,7 +363,7 @@ def thrown(
 
 
 def _lossless(hand: Any) -> Any:
-    """Remove the dampers and the voluntary motion of a chain; return any other hand unchanged."""
+    """Return a chain without dampers and voluntary motion, and any other hand unchanged."""
     if not isinstance(hand, Human):
         return hand
     links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
@@ -368,9 +371,9 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Callable[[int], None]) -> float:
-    """Return the least energy [J] that entered the port in runs of 1 s with random device motions that stop and turn.
+    """Return the least energy [J] that had entered the port at any tick of _BRAKED runs of 1 s.
 
-    `done` is called with the number of finished runs.
+    The devices move at random, stop and turn back. `done` is called with the number of finished runs.
     """
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
@@ -392,9 +395,10 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Call
 def least_at_port(
     scenario: Scenario, coupling: Coupling, seed: int, progress: Callable[[int, int], None]
 ) -> dict[str, float]:
-    """Return for each adversary the least energy [J] that entered the port; it is negative if the scene gave energy.
+    """Return for each adversary the least energy [J] that had entered the port; below 0 the scene gave energy.
 
-    The scene has no shell, or one that never acts. `progress` is called with the numbers of finished and of all runs.
+    The scene has no shell, or a shell that never acts. `progress` is called with the numbers of finished and of all
+    runs.
     """
     total = _BRAKED + _ADVERSARIES
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed, lambda done: progress(done, total))}
@@ -409,8 +413,8 @@ def least_at_port(
 def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence[str] = (), T: float = 1e-3) -> Network:
     """Return the linear network of a scene near a pose, for designs that need an environment.
 
-    Contacts stay open or closed as in the pose, and rotations are small. A coupling that is designed for the network
-    is certified for it, not for the scene.
+    Contacts stay open or closed as in the pose, and rotations are small. A coupling that is designed for the network is
+    certified for this network, not for the scene.
 
     Args:
         world: A scenario with a world, or an MJCF file.
@@ -454,7 +458,7 @@ def _pose_words(pose: Any) -> str:
 
 
 def _joined(G: Lti) -> Lti:
-    """Return the system without the states of bodies that are connected to no contact."""
+    """Return the system without the states of bodies that no chain of parts connects to a contact."""
     size = np.abs(G.A).max(initial=1.0)
     linked = np.abs(G.A) > _ROUNDING * size
     driven, seen = (np.abs(G.B) > 0).any(axis=1), (np.abs(G.C) > 0).any(axis=0)

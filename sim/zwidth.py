@@ -1,9 +1,10 @@
-"""Z-width maps: safe K and B by certificates, with random humans, and in simulations.
+"""Z-width maps: which stiffness K and damping B is safe, by certificates, with random humans, and in simulations.
 
-With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
-against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact.
-For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with humans of a population. For a
-few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
+With `CouplingSweep` K and B are the gains of a spring-damper coupling on every channel, in one environment or against a
+rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B are those of every spring at a contact. A cell is
+one pair (K, B). For each cell a map has the required damping of each condition, and the eigenvalues of the exact loop
+with humans of a population. For a few cells it also has runs in MuJoCo with the encoder steps, friction and walls of
+the scenario.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from haptic_loop.sim.stability import MARGINAL
 
 @dataclass(frozen=True, eq=False)
 class _Sweep(ABC):
-    """A sweep over K and B for these devices, delays and environment; arrays K and B (n,) hold the gains of n cells."""
+    """A sweep over K and B for these devices, delays and environment. Arrays K and B (n,) are those of n cells."""
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
@@ -56,7 +57,7 @@ class _Sweep(ABC):
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of a condition at one point, by a separate frequency sweep, to check the map."""
+        """Return the requirement of a condition at one point. It is computed apart from the map, and can check it."""
 
     @cached_property
     def judges(self) -> dict[str, Condition]:
@@ -71,33 +72,36 @@ class _Sweep(ABC):
 
     @property
     def decisive(self) -> str:
-        """The name of the condition that must hold at every point of --mark."""
+        """The name of the condition that must certify every point of --mark."""
         return (self.own or THIS_ENVIRONMENT).name
 
     def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
         return np.array([self.requirement(condition, k, b).ratio for k, b in zip(K.tolist(), B.tolist(), strict=True)])
 
     def _actuators(self) -> tuple[Array, Array]:
-        """Return unreachable force limits [N] and the encoder steps [m], (m,) each."""
+        """Return force limits [N] that no force reaches, and the encoder steps [m], (m,) each."""
         devices = limit_cycles.unlimited(self.devices)
         return np.array([d.force_limit for d in devices]), np.array([d.encoder_step for d in devices])
 
 
 @dataclass(frozen=True, eq=False)
 class CouplingSweep(_Sweep):
-    """A sweep over K and B, which all channels of the coupling share. Raises ValueError naming a wrong field."""
+    """A sweep over K and B of a spring-damper, equal on all channels. Raises ValueError if the loop has a wrong field."""
 
     def __post_init__(self) -> None:
         check_loop(self.loop)
 
     @property
     def usual_scale(self) -> str:
-        """Return "linear" for a rigid wall, else "log", because couplings far above `stiffness_scale` can be safe."""
+        """The scale of the axes: "linear" for a rigid wall, otherwise "log".
+
+        In an environment, a coupling can be safe with a stiffness far above `stiffness_scale`.
+        """
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
     def stiffness_scale(self) -> float:
-        """The largest bound 2 delta/((theta + 1) T) [N/m] of a channel's stiffness for any passive environment."""
+        """The largest of the channels' bounds 2 delta/((theta + 1) T) [N/m] on K for any passive environment."""
         return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
@@ -107,13 +111,13 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """condition -> (multiplier (m,) for all couplings, or None; reason why the loop is not covered, or None)."""
+        """For each condition its multiplier (m,) for all couplings, or None; and why it does not apply, or None."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """Return F of every coupling, a stack for each set of touching walls, the set of all walls first.
+        """Return for each set of touched walls a stack of F of every coupling; the set of all walls comes first.
 
-        A rigid wall always touches, because a device without contact is safe.
+        A rigid wall is always touched here, because a device without contact is safe.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
@@ -124,7 +128,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,); with walls, for contact that makes and breaks.
+        """Return required over available damping (n,). With walls it is for contact that makes and breaks.
 
         The ratio is inf if the condition does not apply, or if no damping is enough.
         """
@@ -136,7 +140,7 @@ class CouplingSweep(_Sweep):
             each = [None] * self.loop.channels if multiplier_of is None else [(p,) for p in multiplier_of.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
-        elif self.walls and judge.guarantee(self.loop) != ANY:  # Every coupling has its own multipliers.
+        elif self.walls and judge.guarantee(self.loop) != ANY:  # Then each coupling needs multipliers of its own.
             return self._one_by_one(condition, K, B)
         shares = [judge.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
         known = [ratios for ratios in shares if ratios is not None]
@@ -192,7 +196,7 @@ class EnvironmentSweep(_Sweep):
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """Return F in every environment as one stack; the coupling's model is that of the cell."""
+        """Return F in every environment as one stack. A coupling with a model has that of the cell's environment."""
         return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array) -> list[Process]:
@@ -217,7 +221,7 @@ class EnvironmentSweep(_Sweep):
 
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
-        """condition -> requirement, for conditions that do not depend on the springs, or do not apply."""
+        """The requirements, by condition, that are equal in all cells or whose condition does not apply."""
         requirements: dict[str, Requirement] = {}
         for name, each in self.judges.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
@@ -248,7 +252,7 @@ def contact_springs(network: environment.Network) -> tuple[environment.Spring, .
 
 
 def _press_directions(loop: Loop) -> Array:
-    """Return the signs (m,) of the hands' steady forces: into walls at contacts with walls, else alternately +1, -1."""
+    """Return the signs (m,) of the hands' steady forces: into the wall of a contact, otherwise +1 and -1 in turn."""
     directions = (-1.0) ** np.arange(loop.channels)
     for i, name in enumerate(loop.environment.contacts):
         for wall in loop.environment.walls:
@@ -281,7 +285,7 @@ class Grid:
         return K.ravel(), B.ravel()
 
     def subset(self, count: int) -> limit_cycles.Cells:
-        """Return flat indices (k,) of the cells in at most `count` rows and columns, with the corners."""
+        """Return flat indices (k,) of the cells in at most `count` rows and columns, which include the corners."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
@@ -289,9 +293,9 @@ class Grid:
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
-    The scale of K is the sweep's stiffness_scale, that of B the largest delta. A linear map goes up to 2.5 times these
-    scales, a logarithmic one from 1/30 to 30 times (K) and from 1/100 to 10 times (B). Raises InputError for an
-    impossible range, or a mark outside.
+    The unit of K is here the sweep's stiffness_scale, and that of B the largest delta. A linear map goes up to 2.5
+    units. In a logarithmic map K goes from 1/30 to 30 units, and B from 1/100 to 10 units. Raises InputError for an
+    impossible range, or if a mark is outside of a given range.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":
@@ -314,7 +318,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
-    """Widen a range so that positive marks lie well inside."""
+    """Return a range that is wide enough for all positive marks."""
     low, high = usual
     return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
@@ -329,13 +333,13 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
         raise InputError(f"{option} begins at 0, which a logarithmic map cannot show: choose a lower end above 0")
 
 
-_SLICE = 60  # number of cells whose ratios are computed together; with walls 1
+_SLICE = 60  # number of cells whose ratios are computed together; with walls it is 1
 _SAMPLE = 25  # number of cells that decide which humans are tried first (`HeldDevices.leading`)
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Results over the grid, (cells,) each, B running fastest; nan for cells that an interruption left out."""
+    """Results over the cells of the grid, (cells,) each, in the order of `Grid.flat`; nan: not done before Ctrl-C."""
 
     grid: Grid
     ratio: dict[str, Array]  # condition -> required over available damping
@@ -353,7 +357,7 @@ def draw_map(
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],
 ) -> Map:
-    """Compute the map; `progress` is called with (stage, done, total). After Ctrl-C, return the finished cells."""
+    """Return the map. After Ctrl-C it has only the finished cells. `progress` is called with (stage, done, total)."""
     K, B = grid.flat
     seconds, n = {}, K.size
     ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.judges}
@@ -399,7 +403,7 @@ def draw_map(
 def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
     """Return the worst growth [1/s] in a cell with the force maps `states`, and the number of unstable humans.
 
-    The humans of the mask `leading` are tried first, and the others only if none of these is unstable.
+    The humans of the mask `leading` are tried first. The others are tried only if no leading human is unstable.
     """
     growth = np.max([held.growth(F, leading)[0] for F in states], axis=0)
     if not (growth > MARGINAL).any() and not leading.all():
@@ -416,13 +420,13 @@ def _in_slices(
 ) -> tuple[list[tuple[slice, _Part]], bool]:
     """Return (slice, task(slice)) for slices of `size` that cover range(count), and whether the keyboard interrupted.
 
-    After an interruption, only slices that were finished are returned.
+    After an interruption only finished slices are returned.
     """
     parts: list[tuple[slice, _Part]] = []
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     slices = [slice(first, min(first + size, count)) for first in range(0, count, size)]
     pool = ThreadPoolExecutor(cores)
-    try:  # Ctrl-C may also come while tasks are submitted, which must not keep the program until all have run.
+    try:  # Ctrl-C may also come while tasks are submitted. Then the program must not wait until all have run.
         for part, values in zip(slices, pool.map(task, slices), strict=True):
             parts.append((part, values))
             progress(part.stop, count)
@@ -440,7 +444,7 @@ _HALVINGS = 20  # bisections, which give an edge of the population with a relati
 
 @dataclass(frozen=True)
 class Mark:
-    """One point, and the largest safe K at the same B: None if no tried K is safe, inf if the largest tried K is."""
+    """One point, and the largest safe K at its B: None if no tried K is safe, inf if the largest tried K is safe."""
 
     K: float  # [N/m]
     B: float  # [N s/m]
@@ -452,15 +456,15 @@ class Mark:
 
 @dataclass(frozen=True)
 class MapError:
-    """Largest errors of the map against single sweeps."""
+    """Largest errors of the map, compared with single evaluations of a condition."""
 
     figure_relative: float  # relative error of required over available damping, in cells beside the edge
-    edge_relative_in_K: float  # relative error of the K at the edge, interpolated between two rows
+    edge_relative_in_K: float  # relative error of the K of the edge, which the map interpolates between two rows
     columns_compared: int
 
 
 def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
-    """Evaluate each condition and the population at (K, B), and find the largest K that each of them allows at B."""
+    """Return the results of each condition and of the population at (K, B), and the largest K that each allows at B."""
 
     def calm(k: float) -> bool:
         return bool((_growth(sweep, held, k, B) <= MARGINAL).all())
@@ -478,7 +482,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
 
 
 def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
-    """Compare up to _COLUMNS columns in which K crosses the edge with single sweeps; None without such columns."""
+    """Return the errors of the map in up to _COLUMNS columns that have an edge; None if no column has one."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = suffices(ratio)
     crossing = inside[:-1] & ~inside[1:] & np.isfinite(ratio[1:])
@@ -509,7 +513,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Return the growth [1/s] with every human, the largest over all sets of touching walls."""
+    """Return the growth [1/s] with every human, which is the largest for any set of touched walls."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 

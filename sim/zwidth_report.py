@@ -31,7 +31,7 @@ class _Ratio:
 
     required_over_available: Array  # (rows, columns) required over available damping
     certified_cells: int
-    contradicted_cells: int  # number of certified cells that are unstable with a human
+    contradicted_cells: int  # number of certified cells that are unstable with some human
     reason: str | None = off_table("if given")  # why some cells have no figure
 
 
@@ -42,9 +42,9 @@ class _Population:
     humans: int
     seed: int
     growth_rate_per_s: Array  # (rows, columns)
-    unstable_humans_at_least: Array  # (rows, columns), among the humans that were tried in the cell
+    unstable_humans_at_least: Array  # (rows, columns) number of unstable ones among the humans tried in a cell
     stable_cells: int
-    decided_cells: int  # number of cells that were reached before an interruption
+    decided_cells: int  # number of cells with figures; after an interruption fewer than all
     reason: str | None = off_table("if given")
 
 
@@ -155,7 +155,7 @@ class _Simulated:
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The report of a map. Rows are stiffnesses. Null means infinite, not applicable, or not reached."""
+    """The report of a map. Rows are stiffnesses. Null means infinite, not applicable, or not computed."""
 
     rigid: bool
     scenario: str | None
@@ -261,7 +261,7 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
 
 
 def save_csv(drawn: Map, path: Path) -> Path:
-    """Write one line per cell, with SI units in the header; nan becomes an empty field."""
+    """Write one line per cell, with SI units in the header, and return the path. nan becomes an empty field."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     figures = [f"{name} required/available" for name in drawn.ratio]
