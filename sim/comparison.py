@@ -1,9 +1,9 @@
 """Comparison of couplings: with the same devices and hands (`alternatives`), and over frequency (`Comparison`).
 
 The alternatives are: no coupling, the paper's gains (in the paper's loop only), the spring-dampers for any passive
-environment and for this environment, and the optimal coupling if it is quick to find. In loops without walls or
-friction, each also drives the same hands in the exact engine. Over frequency, couplings of the user's choice are
-compared by required damping, robustness and felt impedance.
+environment and for this environment, and the optimal coupling if it is quick to find. In loops without walls and
+friction, the exact engine also runs each alternative with the same hands. `Comparison` compares couplings of the user's
+choice over frequency by required damping, robustness and felt impedance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth, unstable
 from haptic_loop.sim.trace import Trace
 
-#: (kind, condition) in the order of the table -> largest total delay [samples] for which a design is quick
+#: rows (kind, condition) of the table -> largest total delay [samples] for which the design is quick
 _ROWS: dict[tuple[str, str | None], float] = {
     ("none", None): math.inf,
     ("published", None): math.inf,
@@ -56,18 +56,18 @@ class Alternative:
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)
     trace: Trace | None = off_table("left out", None)  # the exact engine's run
-    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of Lambda E for the motion of `trace`
+    ideal: Array | None = off_table("left out", None)  # (N, m) ideal forces [N] for the motion of `trace`
     until_s: float | None = off_table("left out", None)  # time from which the devices' linear model is not credible
 
     @property
     def name(self) -> str:
-        """The name in tables and pictures: of a spring-damper its condition, otherwise the kind of the coupling."""
+        """The name in tables and pictures: the condition of a spring-damper, or the kind of another coupling."""
         if self.coupling == "spring-damper":
             return self.condition or ""
         return self.coupling
 
     def needs(self, condition: str) -> float | None:
-        """Return required over available damping of the worst channel; None if infinite, or if not computed."""
+        """Return required over available damping of the worst channel; None if it is infinite or was not computed."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None
@@ -81,13 +81,13 @@ def alternatives(
     progress: Callable[[int, int], None] = lambda done, of: None,
     also: Condition | None = None,
 ) -> list[Alternative]:
-    """Assess each coupling of `_ROWS` that is possible in the loop; run it if there are no walls and no friction.
+    """Return the assessments of the couplings of `_ROWS` that are possible in the loop.
 
-    Scenarios with walls get no optimal coupling, because it contains a linear model. `also` is a user's own condition,
-    for which the required damping of every coupling is computed in addition.
+    Without walls and friction, the couplings also run. Scenarios with walls get no optimal coupling, because it
+    contains a linear model. If `also`, a user's own condition, is given, it is evaluated for every coupling.
 
     Raises:
-        InputError: the delays switch.
+        InputError: The delays switch.
     """
     if scenario.switches:
         raise InputError("varying_delay: the table of couplings is for constant delays; give --coupling NAME,..")
@@ -176,7 +176,7 @@ class ComparedCoupling:
     def of(
         cls, loop: Loop, name: str, chosen: Chosen, assessment: Assessment, judged: compare.Demands, hz: Array
     ) -> ComparedCoupling:
-        """Compute the curves of one coupling at the frequencies `hz` (k,) [Hz]."""
+        """Return one coupling with its curves at the frequencies `hz` (k,) [Hz]."""
         curves, conditions = compare.curves(loop, judged, hz), {}
         for key, requirement in judged.requirements.items():
             demand, reason = curves.demands[key], requirement.reason
@@ -199,7 +199,7 @@ class ComparedCoupling:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several couplings over frequency; SI units, null where a figure is infinite or does not exist."""
+    """Several couplings over frequency, in SI units. A figure that is infinite or does not exist is null in JSON."""
 
     case: str
     scenario: str
@@ -221,7 +221,7 @@ class Comparison:
 
     @classmethod
     def of(cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str]) -> Comparison:
-        """Compare the couplings `chosen`, by name; `failed` has a sentence for each failed design."""
+        """Return the comparison of the couplings `chosen`, by name; `failed` has a sentence for each failed design."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
         alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # curves show the nominal environment
@@ -232,7 +232,7 @@ class Comparison:
         }
         hz = compare.grid(loop, list(judged.values()))
         short = [Path(name).name for name in chosen]
-        shown = short if len(set(short)) == len(short) else [*chosen]  # Files with the same name keep their paths.
+        shown = short if len(set(short)) == len(short) else [*chosen]  # Equal file names get their paths.
         couplings = [
             ComparedCoupling.of(loop, label, c, assessments[name], judged[name], hz)
             for label, (name, c) in zip(shown, chosen.items(), strict=True)

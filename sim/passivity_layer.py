@@ -2,9 +2,10 @@
 
     figures = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-The code calls such a layer a net. With a net, the linear block of a tick does not contain the delays Theta. The budget
-scales the forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces these forces by those
-of the user's environment. Both send their forces through a delay line, even if the delays are constant.
+The code calls a passivity layer a net. With a net, the linear block of a tick does not contain the delays Theta. The
+budget scales the forces of G = (I + Psi E V)^-1 Psi E, after these are limited as in the actuators. The shell replaces
+these forces by those of the user's environment. Budget and shell send their forces through a delay line, even if the
+delays are constant.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import InputError, require_latch_at_ticks
 
-_HELD = 4  # when packets are lost, a device holds a force for so many ticks beyond the largest delay
+_HELD = 4  # number of ticks beyond the largest delay for which a device holds a force if packets are lost
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class EnergyNet:
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
-        # A device dissipates at least delta |dx|^2 / T in a tick, which is smallest for the longest T.
+        # A device dissipates at least delta |dx|^2 / T in a tick. This bound is smallest for the longest T.
         packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T
         settings: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         settings["encoder_step"] = process.encoder_step
@@ -66,12 +67,12 @@ class EnergyNet:
 class Plugged:
     """A user's function in place of the environment, behind the coupling and a shell that makes it passive."""
 
-    force: Callable[[Array], Array]  # positions (m,) [m] that the port would have without force -> forces (m,) [N]
+    force: Callable[[Array], Array]  # positions (m,) [m] that the port has without force -> forces (m,) [N]
     start: float = 0.0  # W0 [J]
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a new shell for `nsim` runs. Raises ValueError if no shell fits the loop, or for a wrong `start`."""
+        """Return a new shell for `nsim` runs. Raises ValueError if no shell fits the loop, or if `start` is wrong."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("your own environment needs a coupling with a compliance V")
@@ -99,8 +100,8 @@ class Wanted(Protocol):
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """Return the loop with a net between controller and devices, for runs of up to `ticks` (default: the scenario's).
 
-    For linear analyses, such as certificates and modes, use the simulation without a net. Raises InputError for a
-    latency, and the errors of `wanted.net` for impossible settings.
+    For linear analyses, such as certificates and modes, use the simulation without a net. Raises InputError if forces
+    have a latency, and the errors of `wanted.net` if its settings are impossible.
     """
     scenario, process = simulation.scenario, simulation.process
     require_latch_at_ticks(scenario)
@@ -126,7 +127,7 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
         or any(wall.gap < 0 for wall in scenario.environment.walls)  # A wall that is pressed at rest stores energy.
     ):
         return None
-    # Like the budget, this condition counts the devices' damping alone; other conditions count more.
+    # The budget counts only the devices' damping, as any-environment does. Other conditions count more.
     needs = requirements[ANY_ENVIRONMENT.name]
     if not needs.ratio <= 1 - EPS:
         return None

@@ -26,7 +26,7 @@ class Signals(NamedTuple):
 class Contacts:
     """The contacts in a picture: names, places of walls, and the ticks at which a wall is touched."""
 
-    names: Sequence[str] = ()  # (m,) names of the channels; empty for "device 1", ..
+    names: Sequence[str] = ()  # (m,) names of the channels; if empty, they are called "device 1", "device 2", ..
     walls: Sequence[tuple[int, float, str]] = ()  # channel (from 0), position [m] and name of each wall on ground
     touching: NDArray[Any] | None = None  # (N,) whether any wall is touched
 
@@ -38,6 +38,6 @@ class Contacts:
 class Onset:
     """The onset of an oscillation: its predicted growth, and the time up to which the run is credible."""
 
-    growth: float | None  # [1/s] growth predicted by the eigenvalues; None where nothing grows
-    steady: int  # number of ticks before the first clipped one
+    growth: float | None  # [1/s] growth predicted by the eigenvalues; None if no mode grows
+    steady: int  # number of ticks before the first clipped force
     until: float | None = None  # [s] time at which the motion leaves the devices' credible limits; None if never

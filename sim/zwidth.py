@@ -86,7 +86,7 @@ class _Sweep(ABC):
 
 @dataclass(frozen=True, eq=False)
 class CouplingSweep(_Sweep):
-    """A sweep over K and B of a spring-damper, equal on all channels. Raises ValueError if the loop has a wrong field."""
+    """A sweep over K and B of a spring-damper, equal on all channels. Raises ValueError for a wrong field of `loop`."""
 
     def __post_init__(self) -> None:
         check_loop(self.loop)

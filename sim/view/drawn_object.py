@@ -1,7 +1,7 @@
 """The virtual object in pictures: its masses, springs and walls, and the positions of its nodes at each tick.
 
-The displacements of the nodes are computed in addition to the loop and do not affect it. The equations of a tick,
-before the delays Theta, give them as further outputs beside the forces.
+The displacements of the nodes are computed apart from the loop and do not affect it. They are further outputs of the
+equations of a tick, beside the forces before the delays Theta.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from haptic_loop.sim.run import Simulation
 if TYPE_CHECKING:  # --help does not load MuJoCo
     import mujoco
 
-# Distances [m] from handles to contacts, between columns of nodes, and from the floor to the object.
+# Three distances [m]: from handles to contacts, between columns of nodes, and from the floor to the object.
 _FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03
 _RADIUS = {"contact": 0.012, "node": 0.008, "mass": 0.02}  # [m]; a mass is a cube
 SPRING = 0.002  # [m] radius of a drawn spring
@@ -44,7 +44,7 @@ class _Shape(NamedTuple):
 
     kind: Literal["contact", "node", "mass", "spring", "wall"]
     at: Array  # (3,) [m] centre, or the first end of a spring
-    to: Array  # (3,) [m] second end of a spring, or normal of a wall; unused for other shapes
+    to: Array  # (3,) second end [m] of a spring, or normal of a wall; unused for other shapes
 
     @property
     def rgba(self) -> tuple[float, float, float, float]:
@@ -52,12 +52,12 @@ class _Shape(NamedTuple):
 
     @property
     def size(self) -> tuple[float, ...]:
-        """Half the sides of a box [m], or the radius of a sphere [m] in each entry; unused for springs."""
+        """For a box half of each side [m]; for a sphere its radius [m], repeated; unused for springs."""
         return _WALL if self.kind == "wall" else (_RADIUS[self.kind],) * 3
 
     @property
     def quat(self) -> Array:
-        """The quaternion that turns z to the normal of a wall; the identity for other shapes."""
+        """The quaternion that turns the z axis to the normal of a wall; the identity for other shapes."""
         import mujoco
 
         quat = np.array([1.0, 0.0, 0.0, 0.0])
@@ -76,7 +76,10 @@ class DrawnObject:
 
     @classmethod
     def of(cls, network: Network) -> DrawnObject:
-        """Place contacts beside devices, and every other point one column behind its neighbour nearest to a contact."""
+        """Return the network with contacts beside their devices, and other points in columns behind them.
+
+        The column of a point is its least number of springs or walls to a contact.
+        """
         points = tuple(network.points) or tuple(network.nodes())
         nodes = set(network.contacts)
         contacts = tuple(name for name in points if nodes & set(network.coordinates(name)))
@@ -103,7 +106,7 @@ class DrawnObject:
         return _Motion(self.network, coupling, psi, T)
 
     def shapes(self, displacements: Array | None = None) -> Iterator[_Shape]:
-        """Yield the shapes for displacements (nodes,) [m] of the nodes; None means at rest."""
+        """Yield the shapes of the object for displacements (nodes,) [m] of its nodes; None means that it rests."""
         moved = {name: np.zeros(3) for name in self.rest}
         if displacements is not None:
             q = dict(zip(self.network.nodes(), displacements, strict=True))
@@ -141,7 +144,7 @@ class _Motion:
         self._m, nodes = len(network.contacts), len(network.nodes())
         further = nodes + len(network.walls)
         G = walled_environment(network, T, places=True)
-        if coupling.compliance(T) is not None:  # Otherwise the contacts coincide with the devices.
+        if coupling.compliance(T) is not None:  # Without V the contacts move with the devices.
             late = Lti.diag(delay(psi, T), Lti.constant(np.eye(further), T))
             G = Coupling.around(coupling, late @ G, further)
         self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # maps [x; forces on nodes] to [f; nodes' places]
@@ -152,7 +155,7 @@ class _Motion:
         self._nodes, self._next = self._after[self._m : ports, 0], self._after[ports:]
 
     def rest(self, x: Array) -> Array:
-        """Start from the equilibrium without contact for devices at x (m,) [m]; return displacements (nodes,) [m]."""
+        """Start in the equilibrium without contact for devices at x (m,) [m]; return displacements (nodes,) [m]."""
         self._z[:, 0] = self._law.at_rest(np.concatenate([x, np.zeros(self._nodes.size)]))
         self._x[:] = x
         self._tick(self._before, self._after)
@@ -178,7 +181,7 @@ def object_of(simulation: Simulation) -> DrawnObject | None:
 
 
 def scene_xml(simulation: Simulation) -> str:
-    """Return the MJCF of the devices with the object or world at rest beside them, which collides with nothing."""
+    """Return the MJCF of the devices, with the object or the world at rest beside them, which collides with nothing."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(simulation.scene.xml)
@@ -198,7 +201,7 @@ def scene_xml(simulation: Simulation) -> str:
 
 
 def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
-    """Add the geoms of a MuJoCo scene in its initial pose left of the devices, but no meshes, fields or soft bodies."""
+    """Add the geoms of a MuJoCo scene in its initial pose left of the devices, without meshes, fields, soft bodies."""
     import mujoco
 
     with quiet_warnings():

@@ -1,14 +1,14 @@
 """The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
-When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities (in a world it
-restarts from rest). The new process, F with states z, starts at the equilibrium z = A z + B x for these positions x,
-without contact. Its delay lines hold the static force, which is F(1) x if no limiter acts. So the force changes to that
-of the new coupling, and the motion of the environment's masses is lost.
+When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities; in a world it
+restarts from rest. The controller starts a new process, F with states z, at its equilibrium z = A z + B x for these
+positions x, without contact. The delay lines of the new process hold the static force, which is F(1) x if no limiter
+acts. So the force changes to that of the new coupling, and the environment's masses lose their motion.
 
-The mouse is a hand: a spring from the handle to the dragged point, and a damper from the handle to the ground. It is
-part of the exact plant and passive, so a certificate for every passive human covers it. Only the end of the spring
-moves with the mouse, as in a voluntary motion. A force that is computed once per picture would not be passive, because
-it comes too late, and could destabilise a certified loop.
+The mouse is a hand: a spring from the handle to the dragged point, and a damper from the handle to the ground. This
+hand is part of the exact plant and passive, so a certificate for every passive human covers it. Only the end of the
+spring moves with the mouse, as in a voluntary motion. A force that is computed once per picture would come too late to
+be passive, and could destabilise a certified loop.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from haptic_loop.sim.world import START_J, InWorld, Late, WorldFigures, live
 # Events of a running loop, by a key or by a script.
 
 
-#: name of a coupling in scripts -> its name in sim.couplings
+#: name of a coupling in scripts -> name of the coupling in sim.couplings
 COUPLINGS = {"designed" if name == "spring-damper" else name: name for name in NAMES}
-#: name in sim.couplings, which scripts may also use -> name in scripts
+#: name of a coupling in sim.couplings -> its name in scripts; a script may use both names
 LABELS = {kind: label for label, kind in COUPLINGS.items()}
 GIVEN = "given"  # the coupling of --coupling FILE.json
 _STRONGEST = 100.0  # [N] largest push
@@ -55,7 +55,7 @@ _STRONGEST = 100.0  # [N] largest push
 
 @dataclass(frozen=True)
 class Couple:
-    """A change to another coupling, which is chosen for the present delays."""
+    """A change to another coupling, which is chosen or designed for the present delays."""
 
     name: str  # one of COUPLINGS, or GIVEN
 
@@ -70,7 +70,7 @@ class _Delay:
 
 @dataclass(frozen=True)
 class _Push:
-    """A constant force on a handle until the next push of the same channel."""
+    """A constant force on a handle, which lasts until the next push of its channel."""
 
     channel: int  # counted from 1
     force: float  # [N]
@@ -99,7 +99,7 @@ KEYS: dict[int, tuple[str, _Event]] = {
 
 
 def keys_help(with_file: bool) -> list[tuple[str, str]]:
-    """Return the actions of keys and of the mouse; `with_file` adds the key for the coupling from a file."""
+    """Return (key, action) for keys and mouse; `with_file` adds the key for the coupling from a file."""
     keys = [(name, words(event)) for name, event in KEYS.values() if with_file or event != Couple(GIVEN)]
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "pull it")]
 
@@ -108,7 +108,10 @@ Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
 
 
 def parse_script(text: str, channels: int) -> Script:
-    """Parse '0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError for other text."""
+    """Return the events of a text such as '0:none 5:designed 7:theta+1 8:push1=3' in order of time.
+
+    Raises InputError for other text.
+    """
     script = []
     for entry in text.split():
         when, colon, what = entry.partition(":")
@@ -122,7 +125,7 @@ def parse_script(text: str, channels: int) -> Script:
 
 
 def words(event: _Event) -> str:
-    """Write the event as a script spells it."""
+    """Return the event in the words of a script."""
     match event:
         case Couple(name):
             return name
@@ -151,7 +154,7 @@ def _event(entry: str, what: str, channels: int) -> _Event:
 
 
 def _number(text: str) -> float:
-    """Parse a number; for other text return infinity, which every caller refuses."""
+    """Return the number in a text, or infinity for other text, which every caller refuses."""
     try:
         return float(text)
     except ValueError:
@@ -180,7 +183,7 @@ class PreparedLoop:
     label: str  # name of the coupling in scripts
     chosen: Chosen
     simulation: Simulation
-    mode: Mode | None  # dominant mode of the exact loop, over all sets of touching walls; None for a world
+    mode: Mode | None  # dominant mode of the exact loop; with walls, of the worst frozen loop; None for a world
     assessment: Assessment
 
     @property
@@ -236,23 +239,23 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 
 HISTORY = 4.0  # [s] time span of the forces in a picture
 _BLOCK = 64  # largest number of ticks in one block
-LONGEST_LAG = 0.1  # [s] lag that a window may catch up in one frame; the excess of a longer lag is dropped and counted
+LONGEST_LAG = 0.1  # [s] largest lag that a frame of a window catches up; if the lag is longer, the excess is lost
 _STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as in the hands of the default scenario
 
 
 @dataclass
 class _Pace:
-    """Counts the ticks of T seconds that are due on a clock that began at 0."""
+    """A counter of the ticks of T seconds that are due on a clock that began at 0."""
 
     T: float  # [s]
-    patience: float = LONGEST_LAG  # [s]
-    done: int = 0  # ticks
+    patience: float = LONGEST_LAG  # [s] largest lag that is caught up
+    done: int = 0  # number of ticks
     overruns: int = 0  # number of times that the loop fell behind by more than `patience`
     lost: float = 0.0  # [s] clock time without ticks
 
     def due(self, now: float) -> int:
         """Return the number of ticks due at the time `now` [s], and count them as done."""
-        # The addend keeps a rounding error of the clock from hiding a tick.
+        # Without the addend, rounding of the clock could hide a tick.
         ticks = max(0, int((now - self.lost) / self.T + 1e-6) - self.done)
         most = self.patience / self.T
         if ticks > most:
@@ -264,7 +267,7 @@ class _Pace:
         return ticks
 
     def factor(self, now: float) -> float:
-        """Return simulated over clock time: 1 if nothing was lost."""
+        """Return simulated time over clock time, which is 1 if no time was lost."""
         return self.done * self.T / now if now > self.T else 1.0
 
 
@@ -281,17 +284,17 @@ class Grip:
 
     @property
     def pull(self) -> Array:
-        """Force [N] of the hand on a handle that rests at 0, on each axis."""
+        """The force [N] on each axis of the hand on a handle that rests at 0."""
         return _STIFFNESS * np.array(self.target)
 
     def force(self, scene: Scene, s: Array) -> Array:
-        """Return the force [N] of the hand on the handle, on each axis, in the plant state s."""
+        """Return the force [N] on each axis of the hand on the handle, in the plant state s."""
         joints, n = np.array(scene.handles)[list(self.channels)], scene.model.nq
         return self.pull - _STIFFNESS * s[joints] - _DAMPING * s[n + joints]
 
 
 def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
-    """Return the plant with the spring and damper of the mouse's hand on a handle; their other end is fixed."""
+    """Return the plant with the spring and damper of the mouse's hand on a handle. Their other ends are fixed."""
     free, n = scene.plant, scene.model.nq
     A = free.A.copy()
     for channel in channels:
@@ -315,10 +318,10 @@ class Frame:
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks in `history` in which some force is at its limit (controller.tick.at_limit)
     prepared: PreparedLoop
-    note: str  # the last event, with its state or the reason of its refusal, or a remark that the loop diverged
+    note: str  # the last event, perhaps with a reason why it was refused, or a remark that the loop diverged
     overruns: int
     lost: float  # [s]
-    factor: float  # simulated over real time
+    factor: float  # simulated time over clock time
     nodes: Array | None = None  # (nodes,) displacements of the object's nodes [m]
     pose: Array | None = None  # (nq,) positions of a world's scene
     world: WorldFigures | None = None
@@ -336,7 +339,7 @@ class LiveLoop:
             prepared: The first loop.
             executor: Prepares the loops that keys request while the present loop runs.
             script: Events at given times. This constructor prepares their loops.
-            patience: Largest lag behind the clock [s] that is caught up; the excess of a longer lag is dropped.
+            patience: Largest lag behind the clock [s] that is caught up; if the lag is longer, the excess is lost.
 
         Raises:
             InputError, DesignFailed, SingularLoop: An event of the script is impossible.
@@ -368,7 +371,10 @@ class LiveLoop:
         return self._buffer.s[0, :, 0].copy()
 
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
-        """Handle keys and prepared loops, advance to `now` [s] with the mouse's hand `grip`, and return the frame."""
+        """Handle keys and prepared loops, advance to the time `now` [s], and return the frame.
+
+        The mouse's hand holds the device of `grip`, if it is not None.
+        """
         self._take_keys()
         self._take_finished()
         self._hold(grip)
@@ -415,7 +421,7 @@ class LiveLoop:
                 self._happen(event)
 
     def _make(self, event: Couple | _Delay) -> PreparedLoop | str:
-        """Return the loop after an event, or the reason why there is none. The executor runs one event at a time."""
+        """Return the loop after an event, or the reason why the event is refused. The executor runs one at a time."""
         try:
             self._latest = _changed(self._latest, event)
         except (InputError, DesignFailed, SingularLoop) as error:  # The old loop goes on.
@@ -515,7 +521,7 @@ class LiveLoop:
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
-    """Return (tick, event, loop after the event) for each event of the script; None if the event keeps the loop."""
+    """Return (tick, event, loop after the event) for each event; the loop is None if the event does not change it."""
     events = []
     for time, event in script:
         into = None

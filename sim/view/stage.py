@@ -1,9 +1,9 @@
 """Pictures of the window and of films: positions, colours, text, arrows and plots.
 
 The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and mouse to the session. The
-window shows a copy of a world's scene, or of the devices' scene with other shapes. These shapes have no mass and
-collide with nothing, so that the copy has the matrices of the simulated scene. Pillow draws the pictures of a film;
-MuJoCo renders the scene of a world in them. Pillow writes a GIF, and ffmpeg an MP4.
+window shows a copy of a world's scene, or a copy of the devices' scene with other shapes. These shapes have no mass and
+collide with nothing, so that the copy has the matrices of the simulated scene. Pillow draws the pictures of a film, in
+which MuJoCo renders the scene of a world. Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _SIZE = (640, 640)  # pixels of a video
 _WORDS = 0.40  # least share of a video's height for the text at the top
 _PLOT = 0.25  # share of the picture's height for the forces at the bottom
 _WIDTH = 60  # characters in a line of the note on the last event
-_COLUMNS = 250  # time spans in a plot of forces, each drawn from its least to its largest force
+_COLUMNS = 250  # number of time spans in a plot of forces; each has a line from its least to its largest force
 
 _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
@@ -90,7 +90,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """Return the place of each joint's body in units of STEP: motor -1, handle 0, arm, then a person's body."""
+    """Return the place of each joint's body in units of STEP: -1 for a motor, 0 for a handle, then arm and body."""
     place = dict.fromkeys(range(scene.channels), -1)
     for own, points in zip(_channels(scene), scene.points, strict=False):
         place |= {joint: k // len(own) for k, joint in enumerate(points)}
@@ -99,7 +99,7 @@ def _places(scene: Scene) -> tuple[int, ...]:
 
 
 def _scale(history: Array, limit: Array) -> float:
-    """Return a power of two [N] above every force, at least min(1 N, 1/16 of the largest force limit)."""
+    """Return a power of two [N] above every force and above 1 N, or above 1/16 of the largest limit if it is less."""
     least = min(1.0, float(np.max(limit)) / 16)
     return float(2.0 ** np.ceil(np.log2(max(least, 1.05 * np.abs(history).max(initial=0.0)))))
 
@@ -142,7 +142,7 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
 
 
 def _limited(prepared: PreparedLoop) -> str:
-    """Return in words whether a guarantee holds at the force limits."""
+    """Return in words whether a guarantee also holds while forces are at their limits."""
     assessment = prepared.assessment
     if assessment.guarantee is None:
         return "no guarantee"
@@ -170,13 +170,13 @@ def _needs(requirement: Requirement) -> str:
 
 
 def _apart(lines: _Lines) -> tuple[_Lines, _Lines]:
-    """Separate the note on the last event from the other lines if it takes several lines."""
+    """Return the lines in two parts; the second part is the note on the last event if it takes several lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
 
 def _columns(lines: _Lines) -> tuple[str, str]:
-    """Join labels and values as MuJoCo's overlays expect them."""
+    """Return labels and values as two texts, as MuJoCo's overlays expect them."""
     return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
 
 
@@ -201,7 +201,7 @@ class _ShownScene:
         mujoco.mj_forward(self.model, self.data)
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return which handle the mouse grips: that of the device whose body was clicked, or None."""
+        """Return the grip of the mouse on the handle of the clicked device, or None."""
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
@@ -213,7 +213,7 @@ class _ShownScene:
         return Grip(channels[0], tuple((self.data.qpos[handles] + drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
-        """Draw the object and arrows: the mean force on each device, its range since the last frame, and pushes."""
+        """Draw the object, and for each device the mean and the range of its force since the last frame, and pushes."""
         for shape in self.object.shapes(frame.nodes) if self.object else ():
             if shape.kind == "spring":
                 _connect(drawn, _BAR, SPRING, shape.at, shape.to, shape.rgba)
@@ -235,7 +235,7 @@ class _ShownScene:
             _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
-        """Plot each device's forces of the last seconds, side by side at the bottom of a picture."""
+        """Return plots of each device's forces in the last seconds, side by side at the bottom of a picture."""
         width, height = picture.width // len(self._channels), round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = _scale(frame.history, self.force_limit), []
@@ -307,7 +307,7 @@ class _ShownWorld(_ShownScene):
             _connect(drawn, _ARROW, size / 4, at, at + reach * pushes[i] @ along, (0.1, 0.1, 0.1, 1.0))
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
-        """Aim like the scene's own camera, or from the front and somewhat above."""
+        """Aim as the scene's own camera does, or from the front and somewhat above if it has none."""
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         if self.model.ncam:
             camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
@@ -357,7 +357,7 @@ def _dressed(scene: Scene) -> mujoco.MjModel:
 
 
 def _undress(spec: mujoco.MjSpec) -> None:
-    """Delete the shapes of the scene's own file, because this stage has its own shapes and colours."""
+    """Delete the shapes of the scene's file, because the window draws other shapes and colours."""
     drawn = [tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)]
     for part in [*drawn, *spec.geoms, *spec.sites]:
         spec.delete(part)
@@ -385,7 +385,7 @@ def _figure(device: int, low: Array, high: Array, top: float, unit: PositionUnit
 
 
 def _shade(device: int, axis: int) -> _Colour:
-    """Return the colour of an axis of a device; each axis is darker than the one before."""
+    """Return the colour of an axis of a device; each further axis is darker."""
     red, green, blue = _colour(device)
     return red * 0.6**axis, green * 0.6**axis, blue * 0.6**axis
 
@@ -422,7 +422,8 @@ def _connect(
 _RATE = 60.0  # frames per second
 _PATIENCE = 30  # [s] time for the display to answer
 
-# Without a display the viewer's thread dies and its caller waits forever, so a separate process first opens a window.
+# Without a display the viewer's thread ends and its caller waits forever. So another process first tries to open a
+# window.
 _PROBE = (
     "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
     "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
@@ -476,7 +477,7 @@ def _loop(
     sleep: Callable[[float], None],
     until: float | None = None,
 ) -> None:
-    """Show frame after frame, and pass the mouse to the session."""
+    """Show frame after frame, and pass the grip of the mouse to the session."""
     start = clock()
     grip = None
     while window.is_running():
@@ -531,7 +532,7 @@ class _FlatPictures:
         places, owners, first = _places(scene), _owners(scene), dict[int, int]()
         for joint, body in enumerate(scene.model.jnt_bodyid.tolist()):
             first.setdefault(body, joint)
-        #: (number, steps from the handle, device) of each body, in the order of its first joint
+        #: (number, place in units of STEP, device) of each body, in the order of the bodies' first joints
         self._shapes = [(body, places[joint], owners[joint]) for body, joint in first.items()]
 
     def picture(self, frame: Frame) -> Picture:
@@ -553,7 +554,7 @@ class _FlatPictures:
         """Free the renderer, if there is one."""
 
     def _scene(self, image: Image.Image, frame: Frame, top: int, bottom: int) -> None:
-        """Draw bodies, object and forces between two rows of pixels, at least below the share _WORDS of the picture."""
+        """Draw bodies, object and forces between two rows of pixels, but not in the share _WORDS at the top."""
         pen, top = ImageDraw.Draw(image), max(top, round(_WORDS * image.height))
         steps, behind = max(place for _, place, _ in self._shapes) + 1, self.object.reach if self.object else 0.0
         left = max(_LONGEST + STEP, behind)  # [m] width of the picture to the left of the handles
@@ -598,7 +599,7 @@ class _FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw range and mean of the force -f since the last frame, and the push; for several axes only the mean."""
+        """Draw range and mean of the force -f since the last frame, and the push; with several axes only the mean."""
         channels = self._channels[device]
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
@@ -663,7 +664,7 @@ class _WorldPictures(_FlatPictures):
         return pixels[::-1]
 
     def close(self) -> None:
-        """Free the renderer, because the next renderer would otherwise share its texture numbers."""
+        """Free the renderer. Otherwise the next renderer would share its texture numbers."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
@@ -673,7 +674,7 @@ class _WorldPictures(_FlatPictures):
 
 
 def pictures_for(session: LiveLoop) -> _FlatPictures:
-    """Return the painter of a film's pictures. Raises InputError if a world needs OpenGL and there is none."""
+    """Return the object that draws a film's pictures. Raises InputError if a world needs OpenGL and there is none."""
     simulation, stage = session.prepared.simulation, stage_for(session)
     if isinstance(stage, _ShownWorld):
         return _WorldPictures(stage, simulation.scene, simulation.process.force_limit)
@@ -716,7 +717,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 
 def _palette(first: Picture) -> Image.Image:
-    """Return a palette for the colours of the first picture and of forces that may appear later, bright and shaded."""
+    """Return a palette with the colours of the first picture, and with bright and dark colours of later forces."""
     shades = [np.multiply(shade, light) for shade in (*_PALETTE, _ALARM) for light in (1.0, 0.75, 0.5)]
     strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
     later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
