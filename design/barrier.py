@@ -252,20 +252,6 @@ def solve_triangular(U: Array, b: Array | Complex, transposed: bool = False) -> 
     return x
 
 
-def positive_factor(H: Array) -> Array:
-    """Return the Cholesky factor of a symmetric H > 0. Raises LinAlgError if H is not positive definite."""
-    # The transpose is in LAPACK's order of entries, so that H is not transposed in memory.
-    factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(H).T, lower=True, clean=False)
-    if fault:
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return factor
-
-
-def solve_positive(factor: Array, b: Array) -> Array:
-    """Return H^-1 b for a matrix H with this `positive_factor`."""
-    return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=True)[0]
-
-
 # The central path ---------------------------------------------------------------------------------------------------
 
 
@@ -312,7 +298,7 @@ class _Expanded:
         self.decrement = float(self._residual @ self._solved(self._residual))
 
     def _solved(self, right: Array) -> Array:
-        return self._scale * solve_positive(self._factor, self._scale * right)
+        return self._scale * _lapack("dpotrs")(self._factor, self._scale * right, lower=True)[0]
 
     def moved(self, to: float) -> tuple[Array, float]:
         """Return the point that a step towards x(to) reaches, and its t.
@@ -367,17 +353,18 @@ class _Expanded:
 
 
 def _scaled_factor(hessian: Array) -> tuple[Array, Array]:
-    """Return (scale, factor of the Hessian times the scale from both sides); a ridge grows until there is a factor."""
+    """Return (scale, Cholesky factor of the Hessian times the scale from both sides); a ridge grows until it exists."""
     scale = 1 / np.sqrt(np.diag(hessian))
     hessian *= scale[:, None]
     hessian *= scale
     diagonal, ridge = hessian.diagonal().copy(), 0.0
     while True:
-        try:
-            return scale, positive_factor(hessian)
-        except np.linalg.LinAlgError:
-            ridge = max(10 * ridge, 1e-14)
-            np.fill_diagonal(hessian, diagonal + ridge)
+        # The transpose is in LAPACK's order of entries, so that the Hessian is not transposed in memory.
+        factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(hessian).T, lower=True, clean=False)
+        if not fault:
+            return scale, factor
+        ridge = max(10 * ridge, 1e-14)
+        np.fill_diagonal(hessian, diagonal + ridge)
 
 
 def _turned(W: Complex) -> Array:

@@ -303,10 +303,9 @@ class _Search:
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
-            slip = program.Slip(beta_of(self.loop, before.certificate), ((),) * len(self.loop.devices))
-            c = before.certificate.multipliers["c"]
-            condition = LimitedForces(slip.beta, len(c) // len(self.loop.devices))
-            return (replace(slip, c=condition.rows(self.loop, c)),)
+            beta, c = beta_of(self.loop, before.certificate), before.certificate.multipliers["c"]
+            condition = LimitedForces(beta, len(c) // len(self.loop.devices))
+            return (program.Slip(beta, condition.rows(self.loop, c)),)
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
     def cases_with(self, slip: program.Slip | None) -> tuple[program.Case, ...]:

@@ -227,6 +227,8 @@ def design(
     _require_few(
         loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
     )
+    if chosen is not ANY_ENVIRONMENT and (reason := chosen.beyond(loop)):
+        raise DesignFailed(None, (), f"{condition}: {reason}")
     if chosen is KNOWN_DEVICE:
         return _for_known_devices(loop, band_hz)
     return _stiffest_known(loop) if chosen is KNOWN_DEVICE_ANY else _for_any_environment(loop)
@@ -336,10 +338,8 @@ def _for_known_devices(loop: Loop, band_hz: tuple[float, float] | None) -> Desig
     """Return the spring-damper of least rms mismatch that known-device certifies.
 
     The search also starts from the result for this-environment, which is returned unless a better one is found. Raises
-    DesignFailed if neither search finds a coupling, or if known-device does not cover the loop.
+    DesignFailed if neither search finds a coupling.
     """
-    if reason := KNOWN_DEVICE.beyond(loop):
-        raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
     starts, band = _starts(loop), band_hz or BAND_HZ
     plain = least_rms(SampledLoop(loop, band), starts, band)
     first = [plain.gains] if plain.gains else []
@@ -381,8 +381,6 @@ def _stiffest_known(loop: Loop) -> Design:
     Re W > chi |W|^2 |1 - 1/z|^2/T, a convex set of (K, B) for each beta. For a given B the largest K is the least upper
     root of a quadratic over all frequencies. B and beta are searched.
     """
-    if reason := KNOWN_DEVICE_ANY.beyond(loop):
-        raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
     K, B = zip(*(gains for own in loop.devices for gains in _stiffest_device(_axes(loop, own))), strict=True)
     coupling = SpringDamper(_rounded(K, _STIFF_DIGITS), _rounded(B, _STIFF_DIGITS))
     return _verified(KNOWN_DEVICE_ANY.judge(loop, coupling), coupling, "stiffness", float(sum(coupling.K)))

@@ -518,11 +518,6 @@ def test_matrix_routines_equal_those_of_scipy(n):
             for transposed in (False, True):
                 x = scipy.linalg.solve_triangular(stored, b, trans=int(transposed))
                 assert (barrier.solve_triangular(stored, b, transposed) == x).all()
-    H, b = rows.T @ rows, rng.standard_normal(n)
-    x = barrier.solve_positive(barrier.positive_factor(H), b)
-    assert (x == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, lower=True), b)).all()
-    with pytest.raises(np.linalg.LinAlgError):
-        barrier.positive_factor(-H)
 
 
 def test_the_barrier_reaches_a_cone_solvers_optimum():
