@@ -134,23 +134,17 @@ class Port:
             raise ValueError("port: an impedance is for ports with one handle, and has the leading axes of `mass`")
 
     @classmethod
-    def chain(cls, links: _Array) -> Self:
-        """Return a chain from the handle to the base; links (..., n, 3) hold mass, damping and stiffness."""
-        n = links.shape[-2]
-        across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
-        return cls(links[..., 0], across, links[..., 1], links[..., 2])
+    def chain(cls, links: _Array, axes: int = 1) -> Self:
+        """Return a chain from the handle to the base.
 
-    @classmethod
-    def chain_in_space(cls, links: _Array, axes: int) -> Self:
-        """Return a chain of links (..., n, 1 + 2 axes^2): mass, then damping and stiffness along each of `directions`.
-
+        A link of `links` (..., n, 1 + 2 axes^2) has a mass, then dampings and stiffnesses along each of `directions`.
         The springs along the axes come last in a link, so that the voluntary force contracts those of the last link.
         """
         n, count = links.shape[-2], axes**2
         between = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
         damping, stiffness = (links[..., 1 + k * count : 1 + (k + 1) * count] for k in range(2))
         flat = (*links.shape[:-2], n * count)
-        across = np.kron(between, directions(axes))
+        across = np.kron(between, directions(axes)) if axes > 1 else between  # kron takes as long as the rest
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
@@ -396,7 +390,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
             ]
             for link in self.links
         ]
-        return Port.chain_in_space(np.array(rows), axes)
+        return Port.chain(np.array(rows), axes)
 
     def voluntary_force(self, t: _Array) -> _Array:
         """Return the force [N] of the equilibrium's motion on the last mass, (N,) or (N, axes), at times t (N,) [s]."""

@@ -642,9 +642,8 @@ class Crowd:
     @property
     def ports(self) -> tuple[Port, ...]:
         """One port per device, each with a leading axis over the sets."""
-        if not self.axes:
-            return tuple(Port.chain(self.links[:, i]) for i in range(self.links.shape[1]))
-        return tuple(Port.chain_in_space(self.links[:, i, :, : 1 + 2 * k**2], k) for i, k in enumerate(self.axes))
+        axes = self.axes or (1,) * self.links.shape[1]
+        return tuple(Port.chain(self.links[:, i, :, : 1 + 2 * k**2], k) for i, k in enumerate(axes))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
