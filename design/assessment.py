@@ -666,7 +666,8 @@ def assess(
     in_band(band_hz, loop.T)
     searched = limiter_proof = limiter_c = None
     if isinstance(coupling, Chosen):
-        proof, limiter_proof, limiter_c = coupling.certificate, coupling.limiter, coupling.c
+        proof, limiter_c = coupling.certificate, coupling.c
+        limiter_proof = coupling.limiter or (proof and proof.limiter)
         certificate, condition = certificate or proof, condition or coupling.required_condition
         if proof and proof.is_for(loop, coupling.coupling):
             searched = coupling.searched  # The search is for this loop only if the proof is.

@@ -42,11 +42,6 @@ class Forked(Generic[_Result]):
             with suppress(OSError):  # There may be too many processes or open files.
                 self._fork()
 
-    @property
-    def begun(self) -> bool:
-        """Whether a second process computes the function."""
-        return self._process > 0
-
     def _fork(self) -> None:
         self._reader, writer = os.pipe()
         # The second process must not handle Ctrl-C or SIGTERM as a command does.

@@ -200,7 +200,6 @@ class Chosen:
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
         condition: The name of the condition.
         kind: The kind of the coupling in reports.
-        phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
         certificate: The Certificate, if this process has proved it or verified it in a file, or None.
         limiter: The Certificate of the file, verified or not, if it covers limited forces, or None.
         c: The multipliers of the limiter that the design found, one row per device, or None.
@@ -214,7 +213,6 @@ class Chosen:
     coupling: Coupling
     condition: str
     kind: str = field(kw_only=True, default="given")
-    phi: Array | None = field(kw_only=True, default=None)
     certificate: Any = field(kw_only=True, default=None)
     limiter: Any = field(kw_only=True, default=None)
     c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)
@@ -242,25 +240,14 @@ class Chosen:
 class Design(Chosen):
     """A coupling with its objective, and the requirement that was computed from the coupling alone.
 
-    Attributes:
-        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
-        condition: The name of the condition that the coupling was designed for.
+    Attributes, beside those of Chosen:
         figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
         objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
         hurried: Whether the time limit ended the search, so that more time may find a better coupling.
-        kind: The kind of the coupling in reports.
         phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
-        certificate: The Certificate, if it was proved in this process.
-        limiter: The Certificate for limited forces, or None.
-        c: The multipliers of the limiter that the design found, one row per device, or None.
-        searched: The search between the vertices of ranges (design.worst_member.Searched), or None.
-        own: The user's own condition (design.conditions.Condition), or None.
-        switching: The range of delays [samples] in which any switching is proved, or None.
-        notes: Remarks on the origin of the coupling, for reports.
-        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, or None.
     """
 
     figure: str
@@ -269,6 +256,7 @@ class Design(Chosen):
     sdps: int = 0
     wall_s: float = 0.0
     hurried: bool = field(kw_only=True, default=False)
+    phi: Array | None = field(kw_only=True, default=None)
 
     def __repr__(self) -> str:
         return f"Design({self.coupling!r} for {self.requirement!r})"

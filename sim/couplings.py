@@ -120,8 +120,7 @@ def own_of(name: str, loop: Loop) -> Chosen:
 def given(coupling: Any, kind: str = "given") -> Chosen:
     """Return the choice of a coupling or of a design with its proofs. None means the loop without a coupling."""
     if isinstance(coupling, Design):
-        proof = (coupling.certificate and coupling.certificate.limiter) or None
-        return replace(coupling, kind=kind, limiter=proof)
+        return replace(coupling, kind=kind)
     alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, FILE.json, or None for no coupling")
     return Chosen(alone, THIS_ENVIRONMENT.name, kind=kind)
 
