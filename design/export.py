@@ -78,7 +78,7 @@ class ExportedBlock:
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
     limiter: Limiter | None = None  # None without one; otherwise `system` is the block while no force is limited
-    single: tuple[float, float] | None = None  # single precision: its largest error, and the largest output
+    single: tuple[float, float] | None = None  # None: double precision; else (largest error, largest output) of single
 
     @property
     def dtype(self) -> type[np.floating]:
@@ -743,17 +743,17 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
             for side, values in (("input", test.inputs), ("output", test.outputs))
         ),
     }
-    loose = name == "coupling"
     for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
         words[word] = ""
     if block.limiter:
         _add_limiter(words, block, block.limiter)
-    words["more_declared"] = Template(_FREE_DECLARED).substitute(words) if loose else ""
-    words["more_defined"] = Template(_FREE_DEFINED).substitute(words) if loose else ""
+    for word, text in (("more_declared", _FREE_DECLARED), ("more_defined", _FREE_DEFINED)):
+        words[word] = Template(text).substitute(words) if name == "coupling" else ""
     return _SOURCE_C.substitute(words)
 
 
 def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) -> None:
+    """Add the C code of the limiter and its tables to `words`."""
     name, dtype = block.name, block.dtype
     integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
     if limiter.balls:
@@ -761,19 +761,13 @@ def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) 
         tables = {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
         integers |= {"AT": balls.at, "FIRST": balls.first, "LAST": balls.last, "END": balls.end}
         words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
-        words |= {
-            "residual": _RESIDUAL.hex() + words["f"],
-            "rounding": _ball_rounding(dtype).hex() + words["f"],
-        }
+        words |= {"residual": _RESIDUAL.hex() + words["f"], "rounding": _ball_rounding(dtype).hex() + words["f"]}
         words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
         words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
         words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
     else:
         tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
-        words |= {
-            "turns": str(_turns(block.system.inputs)),
-            "rounding": _rounding(dtype).hex() + words["f"],
-        }
+        words |= {"turns": str(_turns(block.system.inputs)), "rounding": _rounding(dtype).hex() + words["f"]}
         reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
         words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
     for of, rows in {**tables, "KICK": limiter.kick}.items():
