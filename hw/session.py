@@ -410,7 +410,7 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
     return scenario.replace(device=tuple(devices)) if devices != [*scenario.device] else scenario
 
 
-def default_caps(scenario: Scenario) -> list[float]:
+def _default_caps(scenario: Scenario) -> list[float]:
     """Return the default force cap [N] of every device at the hand.
 
     A constant force F moves a free handle with the damping b no faster than F/b. So F is the smaller of USUAL_CAP and
@@ -429,7 +429,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float | None = 
     Raises:
         InputError: A limit or T is impossible, or a rotary scenario has no radius.
     """
-    each = default_caps(scenario) if cap is None else [cap] * len(scenario.device)
+    each = _default_caps(scenario) if cap is None else [cap] * len(scenario.device)
     scenario = axis_by_axis(scenario)
     if scenario.unit == "rad" and scenario.radius is None:
         raise InputError("radius is missing: give the distance in metres from axis to hand, which scales the limits")

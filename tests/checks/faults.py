@@ -434,8 +434,9 @@ _WEAK = {"examples/hapkit.toml": 1, "three-rigid": 2}
 def _weak_cases(scenario: str, axis: int) -> list[Fault]:
     """Return faults of a device with little damping, for a session with the default force cap."""
     end: dict[str, Any] = {"action": person("stop"), "acts": 1.4, "lasts": 8.0}
+    short: dict[str, Any] = {"lasts": 1.4}
     dies, a = {"lasts": 2.4}, f"axis{axis}"
-    rows = (
+    rows: list[tuple[str, Stage, str, str, dict[str, Any]]] = [
         ("nothing", G.FINISHED, "asked to", "", end),
         ("no STATE arrives", G.LOST, "silence:", "up:drop=1@1", {}),
         ("no FORCE arrives", G.STOPPED, "watchdog:", "down:drop=1@1", {}),
@@ -465,9 +466,9 @@ def _weak_cases(scenario: str, axis: int) -> list[Fault]:
         ("encoder scale 0.4, then the end", G.STOPPED, "", f"{a}:scale=0.4@1", end | {"free": True}),
         ("motor 0.4 times as strong, then the end", G.STOPPED, "", f"{a}:motor=0.4@1", end | {"free": True}),
         ("motor saturates at 0.3 N, then the end", G.STOPPED, "", f"{a}:limit=0.3@1", end | {"free": True}),
-    )
+    ]
     return [
-        Fault(f"{Path(scenario).stem}: {name}", stage, cause, (fault,) * bool(fault), **{"lasts": 1.4} | more)
+        Fault(f"{Path(scenario).stem}: {name}", stage, cause, (fault,) * bool(fault), **short | more)
         for name, stage, cause, fault, more in rows
     ]
 
@@ -502,7 +503,9 @@ def rehearse_faults() -> list[_FaultOutcome]:
     """
     scenario = _lively(load())
     limits = [msgspec.structs.replace(d, force_limit=USUAL_CAP) for d in scenario.device]
-    runs = [(scenario, scenario.replace(device=tuple(limits)), STRONGEST, CASES)]
+    runs: list[tuple[Scenario, Scenario, float | None, Sequence[Fault]]] = [
+        (scenario, scenario.replace(device=tuple(limits)), STRONGEST, CASES)
+    ]
     for name, axis in _WEAK.items():
         weak = _lively(load(str(_ROOT / name) if name.endswith(".toml") else name), _AMPLITUDE)
         runs.append((weak, weak, None, _weak_cases(name, axis)))

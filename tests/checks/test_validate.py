@@ -7,7 +7,6 @@ import pytest
 
 from tests.checks.challenges import challenges
 from tests.checks.endurance import endurance
-from tests.checks.faults import rehearse_faults
 from tests.checks.hard import hard_loops
 from tests.checks.random_loops import proofs, slow, traces
 from tests.checks.tightness import delayed, known, usual
@@ -42,7 +41,6 @@ MEASURED = {
     "traces of slow loops": slow,
     "uneven ticks": uneven_ticks,
     "guarantees at their edge": challenges,
-    "faults of a link": lambda seed: rehearse_faults(),
     "memory of long work": endurance,
 }
 
