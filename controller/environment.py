@@ -573,9 +573,9 @@ _Sum = dict[int, Fraction]  # a sum over displacements of internal nodes: index 
 def _free_directions(network: Network, parts: Sequence[Spring | Wall], T: Number) -> list[tuple[int, Array]]:
     """Return the directions in which no stiffness resists the internal nodes, each as (node, displacements (n,)).
 
-    The position in such a direction affects no force and would be an unobservable integrator. The node of a direction
-    moves by 1 in it and not at all in the others; `_realise` stores positions relative to this node. The elimination is
-    exact, and the result has the arithmetic of T.
+    The position in such a direction affects no force and would be an unobservable integrator. Each direction has a node
+    that moves by 1 in this direction and not at all in the other ones. `_realise` stores positions relative to this
+    node. The elimination is exact, and the result has the arithmetic of T.
     """
     inner = {name: i for i, name in enumerate(network.nodes()[len(network.contacts) :])}
     lengths = [ends for part in parts if part.stiffness > 0 for ends in network._lengths(part)]
@@ -650,7 +650,7 @@ def _realise(
     """Return A, B, C, D of E(z) for the network (M, D, K) whose first `c` nodes are contacts.
 
     With `across` (w, nodes) E has w more inputs, the forces against the displacements `across q`, and w more outputs,
-    these displacements. In each direction of `free` (node, displacements) positions are relative to that of the node.
+    these displacements. In each direction of `free` (node, displacements) positions are relative to this node.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (

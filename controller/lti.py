@@ -150,7 +150,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """The number of core states. Delay lines at the outputs do not count: they cost little time in a response."""
+        """The number of states without delay lines at the outputs, because these cost little time in a response."""
         return self._lines[0].size
 
     @property
@@ -182,8 +182,9 @@ class Lti(ReadOnly):
     def at(self, z: ArrayLike) -> Complex:
         """Return G(z), shape z.shape + (p, m). A stack takes z (n, k) or (1, k) and returns (n, k, p, m).
 
-        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`). At other points, for a lower
-        triangular A, or if the sum is inaccurate, it is evaluated by back substitution in the complex Schur form of A.
+        On the unit circle a single system is evaluated as a sum over poles and taps (`_terms`). At other points, for a
+        lower triangular A, or if the sum is inaccurate, a single system is evaluated by back substitution in the
+        complex Schur form of A.
         """
         z = np.asarray(z, dtype=np.complex128)
         if response := self.__dict__.get("_response"):
@@ -200,7 +201,7 @@ class Lti(ReadOnly):
         return G.transpose(2, 0, 1).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """Return C (z I - A)^-1 B, shape (p, m, points). Delay lines add their heads times powers of 1/z."""
+        """Return C (z I - A)^-1 B, shape (p, m, points). Delay lines add the responses of their heads, delayed."""
         core, lines = self._lines
         p, m = self.outputs, self.inputs
         spend(_response_cost(core.size, m, points.size))
@@ -285,7 +286,7 @@ class Lti(ReadOnly):
         return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
 
     def with_response(self, response: Callable[[Complex], Complex]) -> Lti:
-        """Return the system with a faster `at` for points (k,). G @ H uses it if H has one."""
+        """Return the system with a faster `at` for points (k,). G @ H uses the faster `at` of H."""
         system = Lti(self.A, self.B, self.C, self.D, self.T)
         system.__dict__["_response"] = response
         return system
@@ -613,7 +614,7 @@ def _matrix(*rows: Sequence[Complex]) -> Complex:
 
 
 def _product(G: Any, H: Any) -> Any:
-    """Return G @ H. Small matrices are multiplied entry by entry, which is far faster than a product per pair."""
+    """Return G @ H. Small matrices are multiplied entry by entry, which is much faster than NumPy's product."""
     if G.shape[-1] == 1:
         return G * H
     if G.shape[-2:] == H.shape[-2:] == (2, 2):

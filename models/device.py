@@ -111,7 +111,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return isinstance(self.force_limit, Real) and len(self.free) > 1
 
     def channels(self: Any) -> tuple[Device, ...]:
-        """Return the free axes as devices with one axis each; their dampings are the diagonals of the matrices."""
+        """Return the free axes as devices with one axis each. Their dampings are the diagonal entries of the matrices."""
         if self.axes == 1:
             return (self,)
         damping, level = np.diag(self.matrix("damping")), np.diag(self.matrix("delta"))
@@ -136,7 +136,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     motor_mass: float = 0.06  # [kg] assumed; motor and handle have 0.25 kg together
     handle_mass: float = 0.19  # [kg] assumed
-    transmission_stiffness: float = 14500.0  # [N/m] assumed: puts the structural mode near 90 Hz
+    transmission_stiffness: float = 14500.0  # [N/m] assumed: the structural mode is then near 90 Hz
     transmission_damping: float = 0.0  # [N s/m] assumed
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
 
@@ -156,7 +156,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     def most_credible_force(self) -> float:
         """The transmission force [N] up to which its linear model is trusted.
 
-        By default it is three times the motor's force limit, an assumption: a transmission is made for its motor.
+        By default it is three times the motor's force limit. This assumes a transmission that was made for its motor.
         """
         return 3.0 * float(np.max(self.force_limit)) if self.credible_force is None else self.credible_force
 
@@ -272,7 +272,7 @@ def _check_axes(self: Any) -> None:
 
 
 def _check_damping(self: Any) -> None:
-    """Raise ValueError unless 0 < delta <= damping, as matrices for several axes; one axis may have no damping."""
+    """Raise ValueError unless 0 < delta <= damping. Several axes have matrices; one axis may have the damping 0."""
     if self.axes == 1:
         for name in ("damping", "delta"):
             if isinstance(getattr(self, name), tuple):
@@ -330,7 +330,7 @@ class Listed:
     """A real device along one axis. A field is None if no source publishes its number."""
 
     title: str
-    kind: _Known | None = None  # kind of the model that the source identified; without it a scenario assumes "rigid"
+    kind: _Known | None = None  # kind of the model that the source identified; None means "rigid"
     damping: _Known | None = None  # [N s/m]
     mass: _Known | None = None  # [kg] felt at the handle
     force_limit: _Known | None = None  # [N]
@@ -408,7 +408,7 @@ def listed_device(name: str) -> tuple[str, Listed]:
 def fields_of(name: str, own: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a scenario's [[device]]: the catalogue's fields, overridden by the scenario's `own` fields.
 
-    Raises ValueError for an unknown name, or for a required number that is in neither of them.
+    Raises ValueError for an unknown name, or if a required number is neither in the catalogue nor in `own`.
     """
     key, device = listed_device(name)
     fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}

@@ -18,7 +18,10 @@ _Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class HeldPlant:
-    """The plant under a hold of T s: s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]; leading axes hold many plants."""
+    """The plant with inputs that are held for T [s]: s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k].
+
+    Arrays with leading axes hold many plants.
+    """
 
     A: _Array  # (..., states, states)
     B: _Array  # (..., states, external forces + m)
@@ -68,7 +71,7 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
         if tau == 0:
             rows[..., i, :n] = plant.C[i]
             continue
-        held = hold(plant, tau, [min(other, tau) for other in late])  # forces that latch earlier act already
+        held = hold(plant, tau, [min(other, tau) for other in late])  # forces with an earlier latch act already
         rows[..., i, :] = held.C[i] @ np.concatenate([held.A, held.B], axis=-1)
     return rows
 
@@ -137,12 +140,12 @@ _ORDER = 13  # order of the diagonal Padé approximant, Higham (2005), table 2.3
 _LARGEST = 5.37  # largest 1-norm for which this order has the accuracy of double precision
 _PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
 
-Product = Callable[[_Array, _Array], object]  # reads a slab (columns, nsim) and writes the product (rows, nsim)
+Product = Callable[[_Array, _Array], object]  # reads an array (columns, nsim) and writes the product (rows, nsim)
 _Which = NDArray[np.intp]
 
 
 def product_of(matrices: _Array) -> Product:
-    """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
+    """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with an array (columns, nsim).
 
     A stack of matrices is split into independent blocks, such as a device with its human. All entries outside the
     blocks are 0.

@@ -216,8 +216,8 @@ class World:
 
         Args:
             pose: Positions (nq,) of this model, the name of a keyframe of the MJCF file, or None for the initial pose.
-            step: The displacement of each position [m, rad]. Speeds and forces are changed so that they move the scene
-                by about as much in one step.
+            step: The displacement of each position [m, rad]. The changes of speeds and forces move the scene by about
+                this displacement in one step.
 
         Returns:
             A, B, C, D from forces on the contacts [N] to u [m], with the state (q, h v).
@@ -426,7 +426,7 @@ def _off_rest(model: mujoco.MjModel) -> None:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # last two-sided type (equalities, friction)
+_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # MuJoCo lists the two-sided types first
 
 
 class WorldPort:
@@ -559,7 +559,7 @@ class Rows:
     """The constraint rows of the last step, grouped by contact or other constraint."""
 
     force: Array  # (rows,) [N]
-    after: Array  # (rows,) w+, the speed after the step [m/s]
+    after: Array  # (rows,) w+, the speed after the step [m/s]; w is the speed before it
     depth: Array  # (rows,) r, negative inside [m]
     D: Array  # (rows,) inverse regularisation of the row's law f = -D ((w+ - w)/h + b w+ + K (r + h w+)) [kg]
     K: Array  # (rows,) reference stiffness [1/s^2]
