@@ -111,7 +111,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return isinstance(self.force_limit, Real) and len(self.free) > 1
 
     def channels(self: Any) -> tuple[Device, ...]:
-        """Return the free axes as devices with one axis each. Their dampings are the diagonal entries of the matrices."""
+        """Return the free axes as devices with one axis each. Their dampings are the diagonals of the matrices."""
         if self.axes == 1:
             return (self,)
         damping, level = np.diag(self.matrix("damping")), np.diag(self.matrix("delta"))
