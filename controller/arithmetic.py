@@ -47,7 +47,7 @@ class _Counter(threading.local):
 
     done = 0  # in 1/_PARTS of a unit; an integer, so that earlier work causes no rounding
     most: float = math.inf  # `done` at which the budget is spent
-    message = ""  # of the TooLong that `spend` raises
+    message = ""  # text of the TooLong that `spend` raises
     over: Callable[[], bool] | None = None  # returns whether the user's time limit is over
 
 
@@ -72,7 +72,7 @@ def spent_after(units: float) -> int:
 
 
 def units_since(before: int) -> float:
-    """Return the work that was counted since `spent` was `before` [units]."""
+    """Return the work [units] that was counted since `spent` returned `before`."""
     return (_counter.done - before) / _PARTS
 
 
@@ -292,7 +292,7 @@ def solve(M: Array, right: Array) -> Array:
 
 
 def _solve_exactly(M: Any, right: Any) -> Any:
-    """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
+    """Return X with M X = right over the Fractions, by sparse elimination. Raises SingularLoop if M is singular.
 
     The next pivot is in the row with the fewest entries. In this row it is in the column with the fewest entries
     (Markowitz). So few zeros become nonzero.

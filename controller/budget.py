@@ -58,7 +58,7 @@ class NetFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ShellFigures(NetFigures):
-    """Figures of a passivity layer that limits forces by an energy W (see the module's docstring)."""
+    """Figures of a passivity layer that limits forces by an energy W."""
 
     start_J: float  # W0
     cap_J: float | None  # the largest W; None if there is no cap
@@ -68,7 +68,7 @@ class ShellFigures(NetFigures):
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetFigures(ShellFigures):
-    """Figures of an energy budget, beside those of ShellFigures."""
+    """Figures of an energy budget, in addition to those of ShellFigures."""
 
     eps: float = EPS
     reserved_J: float  # the largest loss of the packets on their way

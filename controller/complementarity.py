@@ -165,7 +165,7 @@ class BoxProblem(_Problem):
         return v, np.minimum(np.maximum(f, self.lower[:, None]), self.upper[:, None])
 
     def _pivoted(self, q: Array) -> Array:
-        """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
+        """Return v by principal pivoting. All wrong signs change at once, and after 4 n rounds only the first one.
 
         The sign of a force is 1 at its upper limit, -1 at its lower limit, and 0 between them. Changing only the first
         wrong sign terminates for every P-matrix M: index n changes only when all others are right for its present
@@ -324,7 +324,7 @@ class _BallBlock:
         return v, f, lost.size
 
     def _newton(self, u: Array, q: Array) -> Array:
-        """Improve u in P(u) + M (u - P(u))/tau = q by Newton steps for each column; P projects onto the balls."""
+        """Return u with P(u) + M (u - P(u))/tau = q, by Newton steps from the given u; P projects onto the balls."""
         one, starts = np.eye(len(q)), np.cumsum((0, *self.balls))
         for turn in range(_NEWTON):
             v, f = self._of(u)
@@ -351,7 +351,7 @@ class _BallBlock:
         return u
 
     def _bisected(self, q: Array) -> tuple[Array, Array]:
-        """Solve for one vector by bisection: |f| = limit for f = (I + lam M)^-1 q, whose length decreases with lam."""
+        """Return (v, f) of one vector by bisection: |f| = limit, where f = (I + lam M)^-1 q gets shorter with lam."""
         one, limit = np.eye(len(q)), self.limit[0]
         excess = np.linalg.norm(q, axis=0) / limit - 1
         low, high = excess / np.linalg.norm(self.M, 2), excess / np.linalg.eigvalsh((self.M + self.M.T) / 2)[0]
@@ -367,7 +367,7 @@ class _BallBlock:
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
-        """Solve by the Douglas-Rachford iteration, which converges for monotone M, and try Newton steps in between."""
+        """Return (v, f) by the Douglas-Rachford iteration, which converges for monotone M, and by Newton steps."""
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):

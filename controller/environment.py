@@ -35,7 +35,7 @@ MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _LEAST_AMOUNT = 1e-12
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
-_MOST_NODES, _MOST_PARTS = 200, 2000  # nodes and springs; a mass has two states, and a proof can handle a few hundred
+_MOST_NODES, _MOST_PARTS = 200, 2000  # nodes and springs; a mass has two states; proofs handle a few hundred states
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
@@ -128,9 +128,9 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
     A block must be stable, and passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1)
-    symmetric and positive semidefinite. Here He M = (M + M*)/2. If passivity holds within rounding
-    only, `at` makes E(1) symmetric and adds a spring of at most 1e-6 of the block's mean gain to D. Raises ValueError
-    for other blocks, or if passivity cannot be decided.
+    symmetric and positive semidefinite. Here He M = (M + M*)/2. If passivity holds within rounding only, `at` makes
+    E(1) symmetric and adds a spring of at most 1e-6 of the block's mean gain to D. Raises ValueError for other blocks,
+    or if passivity cannot be decided.
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -171,8 +171,8 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-#: Stiffness of a correcting spring up to which `_correction` stops its search, and the largest stiffness that it
-#: accepts, both relative to the mean gain.
+#: Stiffnesses of a correcting spring, relative to the mean gain. `_correction` stops its search once a spring of the
+#: first stiffness is enough, and refuses blocks that need more than the second.
 _ENOUGH, _MOST_LIFT = 1e-8, 1e-6
 
 
