@@ -175,10 +175,7 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
 
 
 def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
-    """Return the standard deviation [N] and the frequency [Hz] of a force in the last _TAIL ticks.
-
-    A parabola through three lines of the spectrum gives the frequency of the peak between the lines.
-    """
+    """Return the standard deviation [N] and the interpolated frequency [Hz] of a force in the last _TAIL ticks."""
     force = trace.f[-_TAIL:, channel]
     level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
     peak = int(np.clip(np.argmax(level[1:-1]) + 1, 1, level.size - 2))

@@ -387,10 +387,7 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Return the findings of all batches, examined in `shards` processes.
-
-    After Ctrl-C, the death of a worker, or a lack of memory, return the findings of the finished batches.
-    """
+    """Return the findings of all batches; after Ctrl-C, a worker's death or lack of memory, of the finished ones."""
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:

@@ -207,10 +207,7 @@ def default_integrator(scene: Scene) -> str:
 
 
 def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
-    """Return the parts of a tick between latch times: (seconds, mask of channels whose previous force still acts).
-
-    The mask is (m,), or (0,) if all forces latch at the beginning of the tick.
-    """
+    """Return the parts of a tick between latches: (seconds, mask (m,) or (0,) of channels with the previous force)."""
     taus = np.array(late or ())
     ends = np.unique(np.concatenate([[0.0], taus, [T]]))
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
@@ -589,10 +586,7 @@ class _PlantSpeed:
 
 
 def pace(A: Array) -> _PlantSpeed:
-    """Return the fastest motions of x' = A x, or of all systems of a stack.
-
-    A mode counts as weakly damped if its eigenvalue has |Im| > |Re|.
-    """
+    """Return the fastest motions of x' = A x, or of a stack. An eigenvalue with |Im| > |Re| counts as weakly damped."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

@@ -34,10 +34,7 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
-    """Plot stiffness over damping, and return the path of the picture.
-
-    Cells show the population, lines the edges of certificates, and symbols the runs in MuJoCo.
-    """
+    """Plot K over B, and return the path: cells for the population, lines for certificates, symbols for MuJoCo."""
     figure = Figure((8, 5.6), layout="constrained")
     axes = figure.subplots()
     about_environment = report.fixed is not None

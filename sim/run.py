@@ -369,18 +369,11 @@ def make_engine(
     substeps: int | None = None,
     T: float | None = None,
 ) -> Engine:
-    """Return an engine for one simulation.
+    """Return an engine for one simulation: a named one, a user's engine, or that which a class or function makes.
 
-    Args:
-        simulation: The loop.
-        engine: The name of an engine, a user's engine, or a class or function that makes one from the simulation.
-        integrator: MuJoCo's integrator; default: `default_integrator`.
-        substeps: MuJoCo's steps per tick; default: `least_substeps`.
-        T: Length [s] of a tick of MuJoCo; default: the ticks of the scenario.
-
-    Raises:
-        ValueError: The name is unknown, the object is no engine, a device has Coulomb friction with the exact engine,
-            or the scenario has `period` or `latency` with a user's own engine.
+    `integrator` and `substeps` are MuJoCo's (default: `default_integrator`, `least_substeps`). A tick of MuJoCo lasts T
+    [s] (default: as in the scenario). Raises ValueError for an unknown name, an object that is no engine, the exact
+    engine with Coulomb friction, or a user's own engine with `period` or `latency`.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)

@@ -444,10 +444,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def own_environment(text: str) -> Any:
-    """Return the object NAME of FILE.py, or the result of calling it if it is a class or function.
-
-    Raises InputError if this fails.
-    """
+    """Return the object NAME of FILE.py, or its result if it can be called. Raises InputError if this fails."""
     own = named("--environment", text)
     return called(f"--environment {text}", own) if callable(own) else own
 
@@ -545,10 +542,7 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
-    """Return the scenario held by the people of a TOML file or of FILE.py:NAME.
-
-    Raises InputError if these people do not fit the scenario.
-    """
+    """Return the scenario with the people of a TOML file or FILE.py:NAME. Raises InputError if they do not fit."""
     people = _load_humans(text, len(scenario.device))
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
@@ -628,10 +622,7 @@ def save_humans(
     persons: tuple[Person, ...] = (),
     mechanics: Sequence[Mechanics] = (),
 ) -> Path:
-    """Write a file for --human, and return its path: humans without voluntary motion, persons, devices' mechanics.
-
-    `remark` becomes a comment at the top.
-    """
+    """Write a file for --human, and return its path. Voluntary motions are left out; `remark` becomes a comment."""
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
         rows = (
@@ -694,10 +685,7 @@ def _require_keys(raw: dict[str, Any]) -> None:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Return the table with the fields of catalogue devices in place of their names.
-
-    Raises InputError for an unknown name.
-    """
+    """Return the table with fields in place of catalogue names of devices. Raises InputError for an unknown name."""
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -792,10 +780,7 @@ _DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the table with path and digest of a world's MJCF file and with the directions of its contacts.
-
-    Raises ValueError for a wrong world.
-    """
+    """Return the table with path, digest and contact directions of its world. Raises ValueError for a wrong world."""
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
         if extra := [key for key in ("along", "every") if isinstance(table, dict) and key in table]:

@@ -142,10 +142,7 @@ def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
 
 
 def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
-    """Return the exact closed loop of each set of humans over T [s] (default: that of F).
-
-    Forces latch `late` (m,) [s] after each tick, or at ticks if it is None.
-    """
+    """Return the exact closed loop of each set of humans; forces latch `late` (m,) [s] after ticks (None: at ticks)."""
     return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
@@ -464,10 +461,7 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class _LateBalance(Balance):
-    """The energies of a tick in which forces latch later, so that the period has a part before and one after the latch.
-
-    `damping` is delta/(T - latency), for the part after the latch.
-    """
+    """The energies of a tick in which forces latch later; `damping` is delta/(T - latency), for the part after it."""
 
     before: Array  # (m, 1) [N/m] delta/latency for the part before the latch; 0 if a force latches at the tick
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
@@ -481,10 +475,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces (ticks, outside) [N] that act for 10 ms, or one tick if it is longer.
-
-    The force is `size` on channel 1, -size/2 on channel 2, size/3 on channel 3, and so on.
-    """
+    """Return forces (ticks, outside) [N] for 10 ms or a longer tick: `size` on channel 1, -size/2 on 2, and so on."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

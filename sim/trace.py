@@ -110,10 +110,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached its limit `force_limit` (m,) [N].
-
-        For the channels of a ball the limit is that of the length of their force vector.
-        """
+        """Return (N,) whether a force reached its limit (m,) [N]; in a ball the length of the force vector counts."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -122,10 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest frequency [Hz], from 10 Hz up, of the forces in the last quarter of the trace.
-
-        Return None for a trace with fewer than 256 ticks, or without such a frequency.
-        """
+        """Return the forces' strongest frequency [Hz], from 10 Hz, in the last quarter; None if it is short or calm."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -188,10 +182,7 @@ class Trace(ReadOnly):
         return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
 
     def save_npz(self, path: Path) -> Path:
-        """Write `arrays` to an .npz file without pickle, and return its path.
-
-        The file is not compressed, because compression would save only a tenth.
-        """
+        """Write `arrays` to an .npz file without pickle, and return its path. Compression would save only a tenth."""
 
         def content(file: BinaryIO) -> None:
             np.savez(file, allow_pickle=False, **self.arrays)
@@ -254,10 +245,7 @@ def slowest_seen(duration: float) -> float:
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Return the strongest oscillation of positions x (ticks, m, nsim) [m], which are the second half of traces.
-
-    An oscillation lasts only if its amplitude exceeds `threshold` [m].
-    """
+    """Return the strongest oscillation of positions x (ticks, m, nsim) [m]; one that lasts exceeds `threshold` [m]."""
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)

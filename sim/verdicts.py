@@ -201,10 +201,7 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Result of the test that W(N) >= 0 (sim.crowds) on traces.
-
-    Traces with clipped forces are left out, but not traces on which a limiter acts.
-    """
+    """The test of W(N) >= 0 (sim.crowds), on the traces without clipped forces, and on all traces with a limiter."""
 
     audited: int  # number of tested traces
     clipped: int  # number of traces that are left out
@@ -229,10 +226,7 @@ _Met = TypeVar("_Met")  # delays or ticks
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """The number of sets of humans with whom the loop grows while delays or ticks vary.
-
-    This number must be 0 if certificates cover the variation (`covered`).
-    """
+    """The number of sets of humans with whom the loop grows while delays or ticks vary; if `covered`, it must be 0."""
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # whether certificates cover the variation

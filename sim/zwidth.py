@@ -93,10 +93,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def usual_scale(self) -> str:
-        """The scale of the axes: "linear" for a rigid wall, otherwise "log".
-
-        In an environment, a coupling can be safe with a stiffness far above `stiffness_scale`.
-        """
+        """Return "linear" for a rigid wall, else "log": in an environment K far above `stiffness_scale` can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property

@@ -108,10 +108,7 @@ Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
 
 
 def parse_script(text: str, channels: int) -> Script:
-    """Return the events of a text such as '0:none 5:designed 7:theta+1 8:push1=3' in order of time.
-
-    Raises InputError for other text.
-    """
+    """Return the events of '0:none 5:designed 8:push1=3' in order of time. Raises InputError for other text."""
     script = []
     for entry in text.split():
         when, colon, what = entry.partition(":")
@@ -371,10 +368,7 @@ class LiveLoop:
         return self._buffer.s[0, :, 0].copy()
 
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
-        """Handle keys and prepared loops, advance to the time `now` [s], and return the frame.
-
-        The mouse's hand holds the device of `grip`, if it is not None.
-        """
+        """Handle keys and prepared loops, advance to `now` [s] while the mouse holds `grip`, and return the frame."""
         self._take_keys()
         self._take_finished()
         self._hold(grip)

@@ -430,7 +430,7 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
 
 def test_refused_designs_for_worlds_name_another(tmp_path):
     words = ["--scenario", "world-door", "--coupling", "spring-damper", "--out", str(tmp_path / "no.json")]
-    with pytest.raises(InputError, match=r"no linear model E\(z\): take moving-average"):
+    with pytest.raises(ValueError, match=r"no linear model E\(z\): take moving-average"):
         import_module("haptic_loop.cli.design").main([*words, "--condition", "any-environment"])
 
 
