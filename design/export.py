@@ -202,16 +202,14 @@ def _sequential(
     limits = _limits(limiter, dtype) if limiter else None
     table = _Balls.of(limiter, dtype) if limiter and limiter.balls else None
     M = _box_matrix(limiter).astype(dtype) if limiter and not table else np.eye(0)
+    start = np.zeros(len(rows), dtype)
     for u in inputs.astype(dtype):
-        sums = np.zeros(len(rows), dtype)
-        for column, value in zip(rows.T, [*z, *u], strict=True):
-            sums = sums + column * value
+        sums = _in_order([start, *(rows * np.concatenate([z, u])).T])
         if limiter and limits is not None:
             free = sums[limiter.sent_rows]
             if limiter.balls or (np.abs(free) > limits).any():
                 e, f = _balled(table, free) if table else _boxed(M, limits, free)
-                for column, value in zip(limiter.kick.astype(dtype).T, e, strict=True):
-                    sums = sums + column * value
+                sums = _in_order([sums, *(limiter.kick.astype(dtype) * e).T])
                 sums[limiter.sent_rows] = f
         outputs.append(sums[: system.outputs])
         z = sums[system.outputs :]
@@ -327,7 +325,7 @@ def _block_of_balls(
     n, real = len(q), q.dtype.type
     residual, rounding, eye = real(_RESIDUAL), real(_ball_rounding(real)), np.eye(n, dtype=real)
     u = back = q
-    length, tried, best = np.empty_like(q), False, real(0)
+    length, tried, best = np.empty_like(q), False, real(0)  # whether u is Newton's step, and the residual before it
     for _ in range(_MOST_STEPS):
         for own in vectors:
             length[own] = np.sqrt(_in_order(u[own] * u[own]))
