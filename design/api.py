@@ -148,7 +148,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     of_kind("loop", loop, Loop, _LOOP)
     alone, (_, own) = fitting(loop, coupling), name_and_own(condition)
     own = own or (coupling.own if isinstance(coupling, Design) else None)
-    requirements: dict[str, Requirement] = dict(requirements_of(loop, alone, own=own))
+    requirements = requirements_of(loop, alone, own=own)
     over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
     for each in over if loop.ranges else ():
         requirements[each.name] = _over_ranges(loop.switching(None), alone, each, requirements[each.name])
@@ -225,17 +225,17 @@ def store(loop: Loop, design: Design, path: Path, assessment: Assessment | None 
     switching delays are not proved, the stored loop has constant delays. Raises InputError if the file cannot be
     written.
     """
-    ranges = assessment and assessment.ranges
+    condition, ranges = named(design.required_condition), assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
     if ranges and ranges.proved and ranges.certificate and ranges.certificate.condition == design.condition:
         certificate, reason = ranges.certificate, None
     else:
-        loop = loop if named(design.required_condition).guarantee(loop) == ANY else loop.at(loop.environment)
+        loop = loop if condition.guarantee(loop) == ANY else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, limiter)
     switching = None
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
-        words = f"{switching_guarantee(loop.varying_delay)}, in {named(design.required_condition).guarantee(loop)}"
+        words = f"{switching_guarantee(loop.varying_delay)}, in {condition.guarantee(loop)}"
         stated = words if assessment is None or assessment.guarantee else None
         switching = _SwitchingFiled(stated, proof, reason)
         if certificate is None:

@@ -170,6 +170,7 @@ def _matrices(condition: Condition, loop: Loop, requirement: Requirement, blocks
 
 
 def _placed(place: str, reason: str) -> str:
+    """Return the reason with the place in front of it, unless it begins with the place."""
     return f"{place}{reason.removeprefix(place)}"
 
 
@@ -199,7 +200,7 @@ _MOST_COST = 2  # largest total cost of the proofs for all members, in units of 
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
-    """Raise NotProved if the condition does not cover the loop, NotProved or TooLong if a proof would take minutes."""
+    """Raise NotProved if the condition does not cover the loop, and NotProved or TooLong if a proof takes minutes."""
     if reason := condition.beyond(loop):
         raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
@@ -417,6 +418,7 @@ def _other_figures(claim: Certificate, needed: Requirement) -> str | None:
 
 
 def _margin(requirement: Requirement) -> float:
+    """Return available over required damping, but at most 1e12."""
     return 1 / max(requirement.ratio, 1e-12)
 
 
