@@ -9,10 +9,8 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from importlib.util import LazyLoader, find_spec, module_from_spec
 from typing import Any, NoReturn
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
@@ -33,7 +31,6 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None, alo
     """
     code: str | int | None
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
-    _load_on_first_use("f2py", "testing")  # SciPy's import names both without using them
     os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown backend would stop the import of matplotlib.
     _streams()
     sys.unraisablehook = _repeat_interrupt
@@ -131,14 +128,3 @@ def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__un
     timer = threading.Timer(_MOMENT, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.daemon = True
     timer.start()
-
-
-def _load_on_first_use(*names: str) -> None:
-    """Load these parts of NumPy only when one of their names is read, which saves a third of SciPy's import time."""
-    for name in names:
-        spec = find_spec(f"numpy.{name}")
-        if spec and spec.loader and spec.name not in sys.modules:
-            loader = spec.loader = LazyLoader(spec.loader)
-            module = sys.modules[spec.name] = module_from_spec(spec)
-            loader.exec_module(module)
-            setattr(np, name, module)
