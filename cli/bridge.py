@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
     below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
     scenario = session.scenario
     session.record = recorder = Recorder(scenario.channels)
-    out = options.out_folder(args, "bridge")
+    out, console = options.out_folder(args, "bridge"), render.console(args)
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
@@ -67,23 +67,20 @@ def main(argv: list[str]) -> int:
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, behind=behind, **energies)
         steps = session.units.encoder_step
         programs = [_with_encoder_steps(program, steps) for program in programs]
-        render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
-        caps = session.limits.cap
-        render.console(args).print(_cap_words(scenario, caps, args.force_cap), soft_wrap=True, highlight=False)
-        _print_certificate(ages, link, programs, caps, render.console(args))
+        console.print(verdict(programs[0].assessment), soft_wrap=True)
+        console.print(_cap_words(scenario, session.limits.cap, args.force_cap), soft_wrap=True, highlight=False)
+        _print_certificate(ages, link, programs, session.limits.cap, console)
         if below:
-            note = (
-                "· delta is a full matrix, but the device's INFO has one number per axis: "
-                "the certificate uses the smaller diagonal matrix"
-            )
-            render.console(args).print(f"{note} {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
+            note = "· delta is a full matrix, but the device's INFO has one number per axis: the certificate uses"
+            matrix = f"the smaller diagonal matrix {', '.join(f'{d:.4g}' for d in below)} N s/m"
+            console.print(f"{note} {matrix}", highlight=False)
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
-    _print_session(report, render.console(args), args.details)  # before files, whose disk may be full
+    _print_session(report, console, args.details)  # before files, whose disk may be full
     files = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
-    render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
+    console.print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
     if signal.SIGHUP in live.signals:  # The terminal is closed, so lost output is no error.

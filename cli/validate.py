@@ -171,7 +171,10 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search for the worst humans, with --environments ranges at the ranges' worst point. Ctrl-C ends the search."""
+    """Return the worst humans that are found, with --environments ranges in the worst environment that is known.
+
+    Ctrl-C ends the search.
+    """
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
@@ -203,7 +206,7 @@ def _save(
     kind: str,
     painter: Painter,
 ) -> list[Path]:
-    """Save the worst and the disagreeing humans for `sim.run --human`, and the picture."""
+    """Save the worst and the disagreeing humans for `sim.run --human`, and the picture. Return the files."""
     scenario, files = question.scenario, []
     humans = "worst-human.toml", "adversary.toml", *(each.name for each in out.glob("disagreement-[0-9]*.toml"))
     render.remove_earlier(out, "population.png", *humans)
@@ -342,7 +345,7 @@ def _tested(
     searched: _Searched,
     certified: bool,
 ) -> dict[str, Any]:
-    """Return the tests of the claims by the names of the report's fields, except that with random humans."""
+    """Return all tests of the claims but the one with random humans, by the names of the report's fields."""
     mode = worst_mode(assemble(question.scenario, chosen.coupling))
     own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
