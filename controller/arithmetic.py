@@ -99,13 +99,8 @@ def within(
         _counter.most, _counter.message, _counter.over = before
 
 
-_PRODUCT = 5e-8  # [units] a product and a sum of short integers; the growth with length was measured up to 5000 bits
+_PRODUCT = 5e-8  # [units] a product and a sum of short integers; the growth with `bits` was measured up to 5000 bits
 _DIFFERENCE = 2e-6  # [units] a product and a difference of short fractions
-
-
-def _spend_on_products(count: int, bits: int) -> None:
-    """Count the work of `count` products of two integers whose lengths add up to `bits`."""
-    spend(_PRODUCT * count * (1 + bits / 64))
 
 
 def _spend_on_differences(count: int, factor: Fraction) -> None:
@@ -259,7 +254,8 @@ def times(left: Array, right: Array) -> Array:
     result = np.full((left.shape[0], right.shape[1]), _ZERO, dtype=object)
     bits = max((den.bit_length() for den in own), default=0) + max((den.bit_length() for den in below), default=0)
     for i, line in enumerate(lines):
-        _spend_on_products(sum(len(entries) for factor, entries in zip(line, rows, strict=True) if factor), bits)
+        products = sum(len(entries) for factor, entries in zip(line, rows, strict=True) if factor)
+        spend(_PRODUCT * products * (1 + bits / 64))
         total = [0] * right.shape[1]
         for factor, entries in zip(line, rows, strict=True):
             if factor:

@@ -224,11 +224,6 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 # problem (controller.complementarity).
 
 
-def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
-    """Return limits (m,) [N] of the channels within which no vector exceeds its limit."""
-    return limit / np.sqrt(np.repeat(sizes, sizes)) if sizes else limit
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Limiter(Law):
     """A law whose forces f_e are limited by a slip e before Theta.
@@ -276,7 +271,9 @@ class Limiter(Law):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self.sizes).tolist(), strict=True))
+        # No vector within this box is longer than its limit.
+        box = self.limit / np.sqrt(np.repeat(self.sizes, self.sizes)) if self.sizes else self.limit
+        return list(zip(self.sent_rows.tolist(), box.tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
         """Return whether the limiter slipped at each tick but the last; the limited force acts theta ticks later."""

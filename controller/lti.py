@@ -138,12 +138,6 @@ class Lti(ReadOnly):
         joined = cls(A, B, C, D, _common_period(*blocks))
         return _with_parts(joined, lambda: tuple(map(block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
 
-    @classmethod
-    def stacked(cls, blocks: Sequence[Lti]) -> Self:
-        """Return a stack of systems of the same shape."""
-        A, B, C, D = (np.stack([getattr(g, name) for g in blocks]) for name in "ABCD")
-        return cls(A, B, C, D, _common_period(*blocks))
-
     @property
     def order(self) -> int:
         return self.A.shape[-1]
