@@ -1,4 +1,4 @@
-"""Is a hand-picked coupling safe for every passive human, and if not, which share of its gains is?
+"""Is a hand-picked coupling safe for every passive human? If not, by which factor must its gains shrink?
 
 The loop is the paper's: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
 """

@@ -1,7 +1,7 @@
 """Touch a recurrent network of random neurons: it has no model and no proof, and yet hands are safe.
 
 The network is behind a coupling certified for any passive environment. A shell makes the network passive: it scales the
-forces so that they never give more energy than the budget. Replace the network by a physics engine or a trained one.
+forces so that they never give more energy than the budget. A physics engine can replace the network.
 """
 
 import sys
