@@ -1,7 +1,7 @@
 """Print reports as tables on the terminal, and write them as JSON.
 
 A report is a dataclass of figures in SI units. Its fields are the keys of its JSON. A field made by `figure` has a name
-and a format, and becomes a row (name, text) of the table; a row whose text is None is left out.
+and a format, and becomes a row (name, text) of the table. A row whose text is None is left out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,11 @@
 """Compare classic passivity layers (PO/PC, energy bounding) with our couplings, in half a minute.
 
-Columns: the rms error of the applied force, relative to the ideal force; the force's rms above 40 Hz and its peak; the
-share of ticks in which the layer changed a force. The last two are about 100 pairs of lossless hands that start at
-0.1 m/s: how many exceed this speed in the tenth second, and the largest speed in that second.
+error %     rms error of the applied force, relative to the ideal force
+> 40 Hz N   rms of the force above 40 Hz
+peak N      largest force
+acted %     share of ticks in which the layer changed a force
+hands       of 100 pairs of lossless hands that start at 0.1 m/s, those that are faster in the tenth second
+m/s         largest speed of these pairs in the tenth second
 """
 
 from dataclasses import dataclass

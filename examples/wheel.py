@@ -1,9 +1,9 @@
 """A force-feedback wheel whose game sends torques at 60 or 360 Hz: which delay theta describes a held torque?
 
-With `unit = "rad"` wheel.toml has rad, N m, N m s/rad and kg m2 in place of m, N, N s/m and kg. A torque
-that is computed within a period of the game (n ticks of the wheel's 1 kHz loop) and held for the next has a mean age of
+With `unit = "rad"` wheel.toml has rad, N m, N m s/rad and kg m2 in place of m, N, N s/m and kg. A torque is computed
+within a period of the game, which is n ticks of the wheel's 1 kHz loop, and held for the next period. Its mean age is
 3 n/2 ticks. The hold of the 1 kHz loop adds half a tick itself, so theta = 3 n/2 - 1/2. The script judges the exact
-loop, whose period is the game's (theta = 1); the 1 kHz loop with that theta needs nearly the same damping.
+loop, whose period is the game's (theta = 1); the 1 kHz loop with theta = 3 n/2 - 1/2 needs nearly the same damping.
 """
 
 import math
