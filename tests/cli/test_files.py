@@ -52,11 +52,17 @@ def test_a_full_disk_keeps_the_old_file(tmp_path):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
-def test_files_are_complete_without_standard_output(tmp_path):
-    words = ["-m", "sim.run", "--duration", "0.1", "--out", str(tmp_path)]
+@pytest.mark.parametrize(
+    ("command", "files"),
+    [
+        ("sim.run --duration 0.1", {"figure.png", "scene.xml"}),
+        ("hw.bridge --rehearse --duration 0.1 --measure 60 --no-plot", {"incidents.jsonl"}),
+    ],
+)
+def test_files_are_complete_without_standard_output(command, files, tmp_path):
+    words = ["-m", *command.split(), "--out", str(tmp_path)]
     with open("/dev/full", "w") as full:
         ended = subprocess.run([sys.executable, *words], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
     assert ended.returncode == 2
     assert ended.stderr.endswith("error: standard output: No space left on device\n")
-    stored = {path.name for path in tmp_path.iterdir()}
-    assert stored == {"figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"}
+    assert {path.name for path in tmp_path.iterdir()} == files | {"report.json", "trace.csv", "trace.npz"}

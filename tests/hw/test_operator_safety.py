@@ -1,6 +1,5 @@
 """Test the deadman, limits, the incident log after a kill, the pre-flight of the machine, and rehearsals."""
 
-import errno
 import itertools
 import json
 import os
@@ -321,21 +320,6 @@ def test_the_incident_log_grows_every_second(scenario, link_couplings, tmp_path)
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):
         IncidentLog(tmp_path)
-
-
-def test_figures_that_cannot_be_printed_are_stored(tmp_path, monkeypatch):
-    """Printing fails because the disk of standard output is full; the session's folder is on a disk with space."""
-
-    def full(*shown):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(bridge, "_print_session", full)
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # The command replaces it, and monkeypatch restores it.
-    words = "--rehearse --duration 0.1 --measure 60 --coupling moving-average --no-plot --out"
-    with pytest.raises(OSError, match="No space left"):
-        bridge.main([*words.split(), str(tmp_path)])
-    sys.stdout.close()  # This is the null device, which the command has opened.
-    assert {path.name for path in tmp_path.iterdir()} == {"incidents.jsonl", "report.json", "trace.csv", "trace.npz"}
 
 
 @pytest.mark.slow
