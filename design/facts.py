@@ -419,39 +419,33 @@ class Latency(HandsSide):
         device = loop.per_channel(range(len(loop.devices)))
         for a, i in enumerate(late):
             if first[i] < last[i] and "q11" in values:
-                q11, q12, q22 = (numbers(values[name][device[i]], T) for name in ("q11", "q12", "q22"))
+                q11, q12, q22 = (numbers(values[name][device[i]], T) for name in _Q)
                 b = len(late) + i
                 form[a, a], form[a, b], form[b, a], form[b, b] = (damping[i] * q for q in (q11, q12, q12, q22))
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return s I - D Q D, D = diag(tau, T_max - tau)^(1/2), for _LATENCIES values of tau in each range."""
-        bounds = []
-        for d in _varies(loop):
-            tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
-            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
-            bounds.append(s * np.eye(2) - D[:, :, None] * Q * D[:, None, :])
-        return bounds
+        """Return s I - D Q D for each device whose latency varies, with the D Q D of `_weighted`."""
+        return [s * np.eye(2) - _weighted(loop, values, d, _LATENCIES) for d in _varies(loop)]
 
     def allowed(self, loop: Loop, values: Values) -> Values:
         shrunk = {name: list(part) for name, part in values.items()}
         for d in _varies(loop):
-            tau = np.linspace(*_ranges(loop)[d], _CLOSER)
-            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
-            most = np.linalg.eigvalsh(D[:, :, None] * Q * D[:, None, :]).max()
+            most = np.linalg.eigvalsh(_weighted(loop, values, d, _CLOSER)).max()
             for less in _LESS:  # The reduction covers rounded entries, and latencies between the samples.
-                entries = [float(f"{(1 - less) / most * Q[a, b]:.{_DIGITS}g}") for a, b in ((0, 0), (0, 1), (1, 1))]
+                entries = [float(f"{(1 - less) / most * values[name][d]:.{_DIGITS}g}") for name in _Q]
                 if _admits(loop, d, entries):
                     break
             else:
-                entries = [*_separate(loop, d)[:1], 0.0, *_separate(loop, d)[1:]]
-            for name, entry in zip(("q11", "q12", "q22"), entries, strict=True):
+                q11, q22 = _separate(loop, d)
+                entries = [q11, 0.0, q22]
+            for name, entry in zip(_Q, entries, strict=True):
                 shrunk[name][d] = entry
         return shrunk
 
     def excess(self, loop: Loop, values: Values) -> str | None:
         for d in _varies(loop):
-            entries = [float(values[name][d]) for name in ("q11", "q12", "q22")]
+            entries = [float(values[name][d]) for name in _Q]
             if not _admits(loop, d, entries):
                 first, last = _ranges(loop)[d]
                 between = f"the latency of device {d + 1}, {first:g} to {last:g} s"
@@ -459,6 +453,7 @@ class Latency(HandsSide):
         return None
 
 
+_Q = "q11", "q12", "q22"  # names of the entries of Q
 _LATENCIES, _CLOSER = 9, 400  # numbers of latencies sampled per range: in a search, and for scaling its result
 _DIGITS = 10  # significant digits of an entry of Q
 _LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4  # relative reductions of Q that are tried
@@ -486,10 +481,11 @@ def _separate(loop: Loop, d: int) -> tuple[float, float]:
     return shares[0], shares[1]
 
 
-def _entries(values: Values, d: int) -> Array:
-    """Return Q (2, 2) of a device."""
-    q11, q12, q22 = (values[name][d] for name in ("q11", "q12", "q22"))
-    return np.array([[q11, q12], [q12, q22]])
+def _weighted(loop: Loop, values: Values, d: int, count: int) -> Array:
+    """Return D Q D (count, 2, 2) of device d, D = diag(tau, T_max - tau)^(1/2), for evenly spaced tau in its range."""
+    tau = np.linspace(*_ranges(loop)[d], count)
+    D, (q11, q12, q22) = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, (values[name][d] for name in _Q)
+    return D[:, :, None] * np.array([[q11, q12], [q12, q22]]) * D[:, None, :]
 
 
 def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
