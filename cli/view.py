@@ -232,13 +232,11 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> dict[str, Any]:
 
 def _window(session: LiveLoop, duration: float | None) -> dict[str, Any]:
     """Show the session in a window. Return fields of the report."""
-    from haptic_loop.sim.view.stage import NoWindow, show, stage_for
+    from haptic_loop.sim.view.stage import show, stage_for
 
     interrupted = False
     try:
         show(session, stage_for(session), duration)
-    except NoWindow as error:
-        raise InputError(f"{error}; --video FILE.gif needs no window") from None
     except KeyboardInterrupt:
         interrupted = True
     clock = {"overruns": session.pace.overruns, "lost_s": session.pace.lost}

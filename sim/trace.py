@@ -144,12 +144,7 @@ class Trace(ReadOnly):
             import pandas  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise ImportError("Trace.to_frame needs pandas, which is not installed: pip install pandas") from None
-        columns = {
-            in_unit(f"{name}{i} [{unit}]", self.meta.get("unit")): column
-            for name, unit in _UNITS.items()
-            for i, column in zip(self._channels, getattr(self, name).T, strict=True)
-        }
-        return pandas.DataFrame(columns, index=pandas.Index(self.t, name="t [s]"))
+        return pandas.DataFrame(self._columns(*_UNITS), index=pandas.Index(self.t, name="t [s]"))
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Any:
         """Draw displacements and forces over time, and return the matplotlib figure.
@@ -204,22 +199,20 @@ class Trace(ReadOnly):
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
-    @property
-    def _channels(self) -> list[str]:
-        """The suffix of each channel in a header: its name, or its number."""
-        return [f" {name}" for name in self.names] or [str(i) for i in range(1, self.x.shape[1] + 1)]
+    def _columns(self, *signals: str) -> dict[str, Array]:
+        """Return the columns of signals by their headers, such as "x1 [m]", or "x left.y [m]" for a named channel."""
+        channels = [f" {name}" for name in self.names] or range(1, self.x.shape[1] + 1)
+        return {
+            in_unit(f"{signal}{i} [{_UNITS[signal]}]", self.meta.get("unit")): column
+            for signal in signals
+            for i, column in zip(channels, getattr(self, signal).T, strict=True)
+        }
 
     def save_csv(self, path: Path) -> Path:
-        """Write time, displacements and forces, one line per sample, with SI units in the header."""
-        channels = self._channels
-        names = [
-            in_unit(f"{name}{i} [{unit}]", self.meta.get("unit"))
-            for name, unit in (("x", "m"), ("f", "N"))
-            for i in channels
-        ]
-        table = np.column_stack([self.t, self.x, self.f])
-        line = ",".join(["%.9g"] * table.shape[1])
-        return write(path, "\n".join([",".join(["t [s]", *names]), *(line % (*row,) for row in table.tolist()), ""]))
+        """Write time, displacements and forces, one line per sample, with units in the header, and return the path."""
+        columns = {"t [s]": self.t} | self._columns("x", "f")
+        line, rows = ",".join(["%.9g"] * len(columns)), np.column_stack([*columns.values()]).tolist()
+        return write(path, "\n".join([",".join(columns), *(line % (*row,) for row in rows), ""]))
 
 
 # ---- octaves, and lasting oscillations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import finite
 from haptic_loop.models.device import Mechanics
-from haptic_loop.models.human import Hand, Human, Link, Person
+from haptic_loop.models.human import Hand, Human, Person
 from haptic_loop.sim.adversary import Worst
 from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
@@ -85,23 +85,12 @@ def disagreement_words(question: Validation, findings: Findings) -> str:
     return "; ".join(words)
 
 
-@dataclass(frozen=True, eq=False)
-class _Held:
-    """A human that holds a device: the links of a Human, or the port of a human of any other class."""
-
-    links: tuple[Link, ...] | None = off_table("if given", None)
-    class_: str | None = off_table("if given", None)
-    mass: Array | None = off_table("if given", None)
-    across: Array | None = off_table("if given", None)
-    damping: Array | None = off_table("if given", None)
-    stiffness: Array | None = off_table("if given", None)
-
-    @classmethod
-    def of(cls, human: Hand) -> _Held:
-        if isinstance(human, Human):
-            return cls(human.links)
-        port = human.port()
-        return cls(None, type(human).__name__, port.mass, port.across, port.damping, port.stiffness)
+def _held(human: Hand) -> dict[str, Any]:
+    """Return the links of a Human, or the class and the port of a hand of another class."""
+    if isinstance(human, Human):
+        return {"links": human.links}
+    port = {name: getattr(human.port(), name) for name in ("mass", "across", "damping", "stiffness")}
+    return {"class": type(human).__name__} | port
 
 
 @dataclass(frozen=True)
@@ -110,7 +99,7 @@ class DrawnHumans:
 
     seed: int
     index: int
-    human: list[_Held]
+    human: list[dict[str, Any]]
     person: tuple[Person, ...]
     environment: str | None = off_table("if given", None)
     network: Network | None = off_table("if given", None)
@@ -121,7 +110,8 @@ class DrawnHumans:
         crowd, member = question.crowd(index), question.environment(index)
         where = (member.name, member.network) if member else (None, None)
         drawn = crowd.mechanics[0] if crowd.mechanics else None
-        return cls(question.seed, index, _held(crowd.humans(0)), crowd.persons(0), *where, drawn)
+        humans = list(map(_held, crowd.humans(0)))
+        return cls(question.seed, index, humans, crowd.persons(0), *where, drawn)
 
 
 @dataclass(frozen=True)
@@ -264,7 +254,7 @@ class Attacked:
     frequency_hz: float
     evaluated: int  # number of sets of humans that were tried
     required_over_available_damping: float | None  # None if no damping is enough
-    human: list[_Held]
+    human: list[dict[str, Any]]
     person: tuple[Person, ...]
     holds: bool
     device: Sequence[Mechanics] | None = off_table("if given", None)  # worst mechanics within the guaranteed bounds
@@ -272,7 +262,7 @@ class Attacked:
     @classmethod
     def of(cls, worst: Worst, ratio: float, certified: bool) -> Attacked:
         figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
-        held = _held(worst.humans), worst.persons
+        held = list(map(_held, worst.humans)), worst.persons
         holds = not (certified and worst.destabilises)
         return cls(worst.destabilises, *figures, finite(ratio), *held, holds, worst.mechanics or None)
 
@@ -281,10 +271,6 @@ class Attacked:
         ratio, verdict = self.required_over_available_damping, grows if self.found else "no destabilising human"
         close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} times its damping"
         return f"{verdict} among {self.evaluated} sets; {close}"
-
-
-def _held(humans: tuple[Hand, ...]) -> list[_Held]:
-    return [_Held.of(human) for human in humans]
 
 
 def largest(values: Array) -> float | None:

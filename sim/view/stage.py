@@ -430,10 +430,6 @@ _PROBE = (
 )
 
 
-class NoWindow(Exception):
-    """The viewer cannot open a window here."""
-
-
 def _display() -> bool:
     """Return whether a window can be opened here."""
     try:
@@ -446,10 +442,11 @@ def _display() -> bool:
 def show(session: LiveLoop, stage: _ShownScene, until: float | None = None) -> None:
     """Run the session in a window until the window is closed, or for `until` [s].
 
-    Raises NoWindow without a display, and on macOS without MuJoCo's own launcher.
+    Raises InputError without a display, and on macOS without MuJoCo's own launcher.
     """
+    instead = "--video FILE.gif needs no window"
     if not _display():
-        raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
+        raise InputError(f"no window can be opened: there is no display, or none with OpenGL; {instead}")
     threads = set(threading.enumerate())
     try:
         from mujoco import viewer  # needs the library of a display
@@ -458,7 +455,7 @@ def show(session: LiveLoop, stage: _ShownScene, until: float | None = None) -> N
             stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
         )
     except RuntimeError as error:
-        raise NoWindow(str(error)) from None
+        raise InputError(f"{error}; {instead}") from None
     try:
         with window:
             with window.lock():
