@@ -130,7 +130,7 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 
 _SKEW_BITS = 32  # fractional bits of the skew matrix S; off the diagonal Q' Delta Q is about 1e-9 of the damping
 _JACOBI_SWEEPS = 12  # Sweeps converge quadratically: 6 axes need about five.
-_BELOW = 1e-11  # relative margin of d below its exact bound, for rounding
+_BELOW = 1e-11  # d is smaller than its exact bound by this share, which covers rounding
 
 
 def _straightened(loop: Loop) -> Loop:
@@ -278,18 +278,18 @@ def _exact_cost(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The required damping is s Delta, with the least s for which some beta and multipliers make the block positive. The
-# bounds of mass and transmission do not scale with s. L is concave in (s, beta). The other entries are affine in beta
-# and in the multipliers, except for switching delays. The entries of switching delays are concave in beta and 1/alpha
-# after the rows of their inputs w (facts.Switching) are divided by alpha. A tangent of a concave block bounds the block
-# from above. The tangents at the binding frequencies form a linear matrix inequality. The least s that satisfies it is
-# a lower bound of the required s.
+# The required damping is s Delta. Here s is the least share of the damping for which some beta and multipliers make the
+# block positive. The bounds of mass and transmission do not scale with s. L is concave in (s, beta). The other entries
+# are affine in beta and in the multipliers, except for switching delays. The entries of switching delays are concave in
+# beta and 1/alpha after the rows of their inputs w (facts.Switching) are divided by alpha. A tangent of a concave block
+# bounds the block from above. The tangents at the binding frequencies form a linear matrix inequality. The least s that
+# satisfies it is a lower bound of the required s.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, at which c0 or c2 is 0
 _LEAST_ETA = 1e-5  # least tried ratio; its requirement is about 0.1 % below the limit of the requirement for beta -> 0
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # A stack of this many matrices takes hardly longer than one matrix. So a step tries up to 31 shares.
-_WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
+_WORST, _IN_A_CUT = 6, 28  # numbers of worst frequencies at which `_Search.least` bisects at once, and of bisections
 _VIOLATED = 3  # largest number of local minima at which `_Search.cut` adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
 _GAP = 3e-6  # relative gap between the best share and the bound at which the search ends
@@ -304,7 +304,7 @@ class _Best(NamedTuple):
     w: float  # binding frequency [rad/sample]
     beta: tuple[float, ...]  # (m,) [s]
     values: tuple[float, ...] = ()  # the multipliers of the facts
-    bound: float = 0.0  # lower bound of the share at the frequencies of the search, for the block less `spare`
+    bound: float = 0.0  # lower bound of the share at the frequencies of the search, after `spare` is subtracted
 
 
 class Sweep:
@@ -415,9 +415,10 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,), and the block at zero beta and multipliers with its slopes in each of them, (.., k, n, n).
+        """Return z (k,), and the block without L as an affine function of beta and the multipliers, (.., k, n, n).
 
-        The margin `spare` of the demand is subtracted from the first block.
+        The first entry is the block at zero beta and zero multipliers, less the margin `spare` of the demand. The
+        others are the slopes in each unknown.
         """
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(self.device.size)
@@ -516,7 +517,7 @@ class _Search:
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
     def run(self) -> _Best:
-        """Return the best result of a refined sweep, after cuts that bring the bound within _GAP of the least share."""
+        """Return the best result of a refined sweep, after tangents bring the bound within _GAP of the least share."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
@@ -551,7 +552,7 @@ class _Search:
         return best._replace(bound=min(bound, best.share)) if best.beta else best._replace(share=np.inf)
 
     def swept(self, x: Array) -> _Best:
-        """Return the share at beta and multipliers of x after their rounding, by a refined sweep."""
+        """Return the share for the rounded beta and multipliers of x, by a refined sweep."""
         beta = tuple(float(f"{b:.{_DIGITS}g}") for b in self.beta(x))
         values = tuple(float(f"{v:.{_DIGITS}g}") for v in self.values(x))
         return _Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)

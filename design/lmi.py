@@ -102,7 +102,7 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
 
 
 def reachability_scaled(G: Lti) -> Array:
-    """Return S (n, n) such that the states S^-1 x of G have the identity as their regularised reachability Gramian."""
+    """Return S (n, n). In the states S^-1 x of G the regularised reachability Gramian is the identity."""
     import scipy
 
     A, W = G.A, G.B @ G.B.T
