@@ -278,7 +278,7 @@ class Timing:
         return k // len(ends) * ends[-1] + begins[k % len(ends)]
 
 
-def drawn(
+def draw_timing(
     T: float,
     periods: Periods | None,
     latency: Sequence[tuple[float, float]] | None,

@@ -417,11 +417,11 @@ class Network(
     def E(self, T: Number) -> Lti:
         if self.world:
             raise _NoModel
-        return environment(held(self), T)
+        return environment(with_frozen_walls(self), T)
 
     def frozen(self) -> Sequence[Network]:
         walls = itertools.product((False, True), repeat=len(self.walls))
-        return tuple(held(self, touching) for touching in walls)
+        return tuple(with_frozen_walls(self, touching) for touching in walls)
 
     def coordinates(self, end: str) -> tuple[str, ...]:
         """Return the nodes of a point's coordinates, or the node of this name."""
@@ -704,7 +704,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
     return np.flatnonzero(used)
 
 
-def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
+def with_frozen_walls(network: Network, touching: Sequence[bool] | None = None) -> Network:
     """Return the network with a spring-damper for each wall, zero if the wall does not touch; by default all touch."""
     if not network.walls:
         return network

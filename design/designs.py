@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
-from haptic_loop.controller.environment import RIGID_WALL, Environment, held
+from haptic_loop.controller.environment import RIGID_WALL, Environment, with_frozen_walls
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
@@ -313,7 +313,7 @@ def _with_less_damping(
     constant = not (made_for or condition).extensible or loop.latency or walls
     where = loop.delayed(loop.delays.hi) if constant else loop
     if condition is KNOWN_DEVICE and walls:
-        where = where.at(held(loop.network))  # The search for gains has no multipliers of walls.
+        where = where.at(with_frozen_walls(loop.network))  # The search for gains has no multipliers of walls.
     all_members = condition.extensible or condition is KNOWN_DEVICE or (made_for and not condition.beyond(loop))
     judged = loop if all_members else loop.at(loop.environment)
     for _ in range(budgets.LESS_DAMPING_ROUNDS):

@@ -17,7 +17,7 @@ from typing import Any, Self, get_args
 import msgspec
 import numpy as np
 
-from haptic_loop.controller.delay import LOST, MOST_SAMPLES, Periods, Timing, VaryingDelay, drawn
+from haptic_loop.controller.delay import LOST, MOST_SAMPLES, Periods, Timing, VaryingDelay, draw_timing
 from haptic_loop.controller.environment import (
     GROUND,
     RIGID_WALL,
@@ -332,7 +332,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def timing(self, seed: int, ticks: int) -> Timing | None:
         """Draw and return the times at which ticks begin and forces latch; None without `period` and `latency`."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
-        timing = drawn(self.T, self.period, self.latency, ticks, rng)
+        timing = draw_timing(self.T, self.period, self.latency, ticks, rng)
         if timing is None or timing.late is None or self.axis_devices is self.device:
             return timing
         return Timing(timing.period, timing.late[:, self.lead])

@@ -14,7 +14,7 @@ from haptic_loop.cli.run import main
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.complementarity import Complementarity
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
-from haptic_loop.controller.environment import GROUND, Network, Wall, environment, held
+from haptic_loop.controller.environment import GROUND, Network, Wall, environment, with_frozen_walls
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.tick import Process
@@ -144,7 +144,7 @@ def test_a_touching_wall_is_a_spring_damper(coupling, psi):
     network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
     x = random_walks(300, 2, 2)
     f = drive(walled(network, coupling, (1, 2), psi), x).f[:300]
-    F = force_map(environment(held(network), T), coupling, (1, 2), psi)
+    F = force_map(environment(with_frozen_walls(network), T), coupling, (1, 2), psi)
     linear = drive(Process(Law(F), np.full(2, np.inf), np.zeros(2)), x).f[:300]
     assert np.abs(f - linear).max() > 100  # the gaps add constant forces
     change, expected = f[..., 0] - f[..., 1], linear[..., 0] - linear[..., 1]
@@ -157,7 +157,7 @@ def test_frozen_walls_equal_springs_where_they_touch():
     states = walls.frozen()
     assert len(states) == 8
     for touching, F in states.items():
-        E = environment(held(BOXED, touching), T)
+        E = environment(with_frozen_walls(BOXED, touching), T)
         np.testing.assert_allclose(F.at(z), force_map(E, SOFT, (1, 2), (0, 0)).at(z), rtol=1e-8)
     np.testing.assert_allclose(walls.open.at(z), states[(False,) * 3].at(z), rtol=1e-9)
 
@@ -257,7 +257,7 @@ def test_walls_need_more_damping_than_frozen_states():
     requirement = requirements_of(loop, SOFT)["this-environment"]
     singles = [
         this_environment(
-            force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
+            force_map(environment(with_frozen_walls(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
         )
         for state in [(False, False), (False, True), (True, False), (True, True)]
     ]
@@ -281,7 +281,7 @@ def test_stiffer_couplings_are_certified_for_known_walls():
     stiff = SpringDamper([1772.0], [0.453])
     assert not required_damping(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())
-    assert required_damping(loop.at(held(loop.network, [False])), coupling, "this-environment").ratio == 0
+    assert required_damping(loop.at(with_frozen_walls(loop.network, [False])), coupling, "this-environment").ratio == 0
 
 
 def test_couplings_with_a_model_refuse_walls():
