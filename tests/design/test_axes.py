@@ -573,11 +573,6 @@ def test_block_triangular_ticks_are_solved() -> None:
     np.testing.assert_allclose(f + M @ v, q, rtol=0, atol=1e-10)  # M v adds terms of up to 1.4e4
 
 
-def test_axes_of_a_device_share_one_limit() -> None:
-    with pytest.raises(ValueError, match="one value for all axes"):
-        LOOP.law(BUILT, [2.0, 3.0, 5.0, 5.0], [1.0] * 4, balls=LOOP.devices)
-
-
 def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> np.ndarray:
     """Return the largest energy of each of `count` lossless hands in the limited LOOP, divided by its first energy.
 
