@@ -38,28 +38,19 @@ def symmetric(field: str, value: Any, axes: int) -> _Matrix:
 
     Raises ValueError for any other value.
     """
-    if isinstance(value, Real):
-        number = float(value)
-        if not np.isfinite(number):
-            raise ValueError(f"{field} is {number:g}, expected a finite number")
-        return number * np.eye(axes)
-    rows = [row if isinstance(row, Real) else tuple(row) for row in value]
-    if len(rows) == axes and all(isinstance(row, Real) for row in rows):
-        numbers = np.array(rows, dtype=float)
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"{field} is {_listed(value)}, expected finite numbers")
-        return np.diag(numbers)
-    if len(rows) != axes or not all(isinstance(row, tuple) and len(row) == axes for row in rows):
-        shape = f"{axes} numbers or {axes} rows of {axes} numbers"
-        raise ValueError(f"{field} is {_listed(value)}, expected one number, {shape}")
-    matrix = np.array(rows, dtype=float)
-    for holds, kind in (
-        (np.isfinite(matrix).all(), "finite numbers"),
-        ((matrix == matrix.T).all(), "a symmetric matrix"),
-    ):
-        if not holds:
-            raise ValueError(f"{field} is {_listed(value)}, expected {kind}")
-    return matrix
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):  # rows of different lengths
+        array = np.empty(0)
+    if array.shape not in ((), (axes,), (axes, axes)):
+        expected = f"one number, {axes} numbers or {axes} rows of {axes} numbers"
+    elif not np.isfinite(array).all():
+        expected = "finite numbers" if array.ndim else "a finite number"
+    elif (array != array.T).any():
+        expected = "a symmetric matrix"
+    else:
+        return array if array.ndim == 2 else np.diag(np.broadcast_to(array, axes))
+    raise ValueError(f"{field} is {_listed(value)}, expected {expected}")
 
 
 def _listed(value: Any) -> Any:
@@ -326,7 +317,7 @@ _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 
 
 
 @dataclass(frozen=True)
-class Listed:
+class _Listed:
     """A real device along one axis. A field is None if no source publishes its number."""
 
     title: str
@@ -350,26 +341,27 @@ class Listed:
 _IDENTIFIED = "section 6 of the paper: a first-order model identified on an Omega 3"
 
 
-def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> Listed:
+def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> _Listed:
     limits = {"force_limit": force, "stiffness": stiffness, "framework_damping": 30.0}
-    return Listed(f"Force Dimension {title}", **{name: _Known(value, _DELTA) for name, value in limits.items()}, **more)
+    published = {name: _Known(value, _DELTA) for name, value in limits.items()}
+    return _Listed(f"Force Dimension {title}", **published, **more)
 
 
-CATALOGUE: Mapping[str, Listed] = {
+CATALOGUE: Mapping[str, _Listed] = {
     "omega.3": _force_dimension("omega.3", 12.0, kind=_Known("rigid", _IDENTIFIED), damping=_Known(1.37, _IDENTIFIED)),
     "omega.6": _force_dimension("omega.6, translation", 12.0),
     "omega.7": _force_dimension("omega.7, translation", 12.0),
     "delta.3": _force_dimension("delta.3", 20.0),
     "delta.6": _force_dimension("delta.6, translation", 20.0),
     "sigma.7": _force_dimension("sigma.7, translation", 12.0, stiffness=4000.0),
-    "falcon": Listed(
+    "falcon": _Listed(
         "Novint Falcon",
         force_limit=_Known(8.0, _FALCON),
         encoder_step=_Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
         stiffness=_Known(3000.0, _FALCON),
         framework_damping=_Known(20.0, _FALCON),
     ),
-    "touch": Listed(
+    "touch": _Listed(
         "3D Systems Touch (SensAble Phantom Omni)",
         mass=_Known(0.045, _OMNI),
         force_limit=_Known(3.3, _OMNI),
@@ -378,7 +370,7 @@ CATALOGUE: Mapping[str, Listed] = {
         stiffness=_Known(700.0, _PHANTOM),
         framework_damping=_Known(5.0, _PHANTOM),
     ),
-    "phantom-premium": Listed(
+    "phantom-premium": _Listed(
         "SensAble Phantom Premium 1.5",
         mass=_Known(0.075, _PREMIUM),
         force_limit=_Known(8.5, _PREMIUM),
@@ -387,15 +379,15 @@ CATALOGUE: Mapping[str, Listed] = {
         stiffness=_Known(800.0, _PHANTOM + " (1.5 6DOF)"),
         framework_damping=_Known(5.0, _PHANTOM + " (1.5 6DOF)"),
     ),
-    "haply-2diy": Listed("Haply 2DIY"),
-    "inverse3": Listed("Haply Inverse3"),
-    "hapkit": Listed("Hapkit"),
+    "haply-2diy": _Listed("Haply 2DIY"),
+    "inverse3": _Listed("Haply Inverse3"),
+    "hapkit": _Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
 _NEEDED = ("damping", "force_limit")  # the defaults of these fields do not apply to devices of the catalogue
 
 
-def listed_device(name: str) -> tuple[str, Listed]:
+def listed_device(name: str) -> tuple[str, _Listed]:
     """Return a device's name in the catalogue and its entry. Raises ValueError for an unknown name."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
