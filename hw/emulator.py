@@ -36,8 +36,6 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
 _BLOCK = 1000  # ticks for which outside forces are computed at once
-_SUBSTEPS = 8  # steps of the plant per tick if there is Coulomb friction
-_SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximum
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
@@ -197,11 +195,10 @@ class _EmulatedPlant:
     """Advance the devices and their passive humans between ticks by the matrix exponential.
 
     The person starts to move at the first tick after `begin`, and holds still while `still` is true: sessions are armed
-    at rest. With `coulomb` [N] every motor also has dry friction, which is updated eight times a tick.
+    at rest.
     """
 
-    def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
-        self.coulomb, self._substeps = coulomb, _SUBSTEPS if coulomb else 1
+    def __init__(self, scenario: Scenario, encoder_step: Array) -> None:
         self.scenario, self.encoder_step = scenario, encoder_step
         self.scene = build(scenario.device, scenario.human, scenario.person)
         self._plant = self.scene.plant
@@ -210,7 +207,7 @@ class _EmulatedPlant:
         self._w = np.zeros(self.scene.outside)
         limit = np.array([device.force_limit for device in scenario.axis_devices])
         self._limits = -limit, limit
-        self._motors = slice(self.scene.model.nq, self.scene.model.nq + scenario.channels)  # speeds of motors in s
+        self.motors = slice(self.scene.model.nq, self.scene.model.nq + scenario.channels)  # speeds of motors in s
         self.still = False
         self.fastest = 0.0  # [m/s] highest speed of any motor so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
@@ -226,27 +223,16 @@ class _EmulatedPlant:
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
         """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
 
-        If a tick `begins`, its outside forces are computed; otherwise those of the last call continue to act.
+        If a tick `begins`, its outside forces are computed; otherwise the outside forces of the last call still act.
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
-        f, held, motors = np.minimum(np.maximum(f, self._limits[0]), self._limits[1]), self._held(share), self._motors
-        if not self.coulomb:
-            self.s = held.dot(np.concatenate((self.s, self._w, f)))
-            return self._note_speed(self.s[motors])
-        size = len(self.s)
-        A, B, slip = held[:, :size], self.coulomb * held[:, -len(f) :], _SLIP / self.scenario.lever
-        pushed = held[:, size:] @ np.concatenate([self._w, f])
-        for _ in range(self._substeps):
-            self.s = A @ self.s + pushed + B @ np.tanh(self.s[motors] / slip)
-            self._note_speed(self.s[motors])
-        return None
-
-    def _note_speed(self, v: Array) -> None:
-        self.fastest = max(self.fastest, *map(abs, v.tolist()))
+        f = np.minimum(np.maximum(f, self._limits[0]), self._limits[1])
+        self.s = self._held(share).dot(np.concatenate((self.s, self._w, f)))
+        self.fastest = max(self.fastest, *map(abs, self.s[self.motors].tolist()))
 
     def _hold(self, share: float) -> Array:
-        held = hold(self._plant, share * self.scenario.T / self._substeps)
+        held = hold(self._plant, share * self.scenario.T)
         return np.hstack([held.A, held.B])
 
     def _next_outside(self) -> Array:
@@ -290,12 +276,11 @@ class Emulator:
         scenario: Scenario,
         faults: tuple[FaultInjection, ...] = (),
         info: Info | None = None,
-        coulomb: float = 0.0,
     ) -> None:
         self.info = info or info_of(scenario)
         self.device = Device(self.info)
         self.device.deadman = True
-        self.plant = _EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
+        self.plant = _EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float))
         self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
         self.armed_at: int | None = None  # [us] time of the first arming, from which faults are timed
         self.begun_at: int | None = None  # tick at which the person began to move

@@ -5,7 +5,9 @@ import pickle
 import re
 import warnings
 
-from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
+import numpy as np
+
+from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, _EmulatedPlant
 from haptic_loop.hw.limits import SafetyLimits
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
@@ -59,6 +61,27 @@ def in_fork(call, *arguments):
     if error is not None:
         raise error
     return result
+
+
+class RubbingPlant(_EmulatedPlant):
+    """An emulated plant whose motors have dry friction of `coulomb` [N], which is updated eight times a tick."""
+
+    def __init__(self, scenario, encoder_step, coulomb):
+        super().__init__(scenario, encoder_step)
+        self.coulomb = coulomb
+
+    def advance(self, f, share=1.0, begins=True):
+        for k in range(8):
+            friction = self.coulomb * np.tanh(self.s[self.motors] / 0.002)
+            super().advance(f + friction, share / 8, begins and not k)
+
+
+class RubbingEmulator(Emulator):
+    """An emulated device with a RubbingPlant."""
+
+    def __init__(self, scenario, *more, coulomb):
+        super().__init__(scenario, *more)
+        self.plant = RubbingPlant(scenario, self.plant.encoder_step, coulomb)
 
 
 class MovesAxes:

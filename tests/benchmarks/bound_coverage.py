@@ -19,10 +19,11 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from haptic_loop.hw.emulator import _EmulatedPlant, nobody
+from haptic_loop.hw.emulator import nobody
 from haptic_loop.hw.identify import Estimate, chirp, identify
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import load
+from tests.sessions import RubbingPlant
 
 FORCE_STEP = 4e-4  # [N] to which the protocol rounds forces
 NOISE = (0.0, 0.0, 0.2, 0.4)  # [encoder steps]
@@ -71,7 +72,7 @@ def estimated(c: Case) -> Estimate:
             base.device[0], damping=c.viscous, delta=None, transmission_stiffness=c.stiffness, **masses
         )
     scenario = nobody(base.replace(device=(device,) * base.channels))
-    plant = _EmulatedPlant(scenario, np.full(base.channels, c.step), c.coulomb)
+    plant = RubbingPlant(scenario, np.full(base.channels, c.step), c.coulomb)
     signal = chirp(base.channels, base.T, 1, 1.0, (3.0, 200.0), c.seconds).signal
     late = np.vstack([np.zeros(base.channels), signal[:-1]])
     applied = -FORCE_STEP * np.round(late / FORCE_STEP)  # The device feels -f.

@@ -32,6 +32,7 @@ from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
+from tests.sessions import RubbingEmulator
 
 STEP = 5e-6  # [m] half of an Omega's encoder step of 0.01 mm
 
@@ -47,7 +48,8 @@ def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
     session.record = recorder
     excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), seconds)
     faults = tuple(map(FaultInjection.parse, faults))
-    rehearsal = Rehearsal(session, Emulator(nobody(scenario), coulomb=coulomb), lambda ages: [excitation], faults)
+    emulator = RubbingEmulator(nobody(scenario), coulomb=coulomb)
+    rehearsal = Rehearsal(session, emulator, lambda ages: [excitation], faults)
     rehearsal.run_until_armed(excitation.seconds + 0.1)
     assert session.stage == Stage.ARMED
     assert np.abs(recorder.link()["sent"]).max() <= 2500  # the chirp's amplitude, 1 N in steps of 0.4 mN
@@ -367,7 +369,7 @@ def test_damping_in_one_sitting_needs_a_third(tmp_path, monkeypatch):
 
     monkeypatch.setattr("haptic_loop.cli.identify._sitting", recorded)
     monkeypatch.setattr("haptic_loop.cli.identify.nobody", held)
-    monkeypatch.setattr("haptic_loop.cli.session_cli.Emulator", partial(Emulator, coulomb=0.02))
+    monkeypatch.setattr("haptic_loop.cli.session_cli.Emulator", partial(RubbingEmulator, coulomb=0.02))
     one = tmp_path / "one.toml"
     text = (SCENARIOS / "one-wall.toml").read_text()
     one.write_text(text.replace('kind = "compliant"', 'kind = "rigid"\nmass = 0.25'))
