@@ -227,7 +227,7 @@ def design(
     _require_few(
         loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
     )
-    if chosen is not ANY_ENVIRONMENT and (reason := chosen.beyond(loop)):
+    if chosen in (KNOWN_DEVICE, KNOWN_DEVICE_ANY) and (reason := chosen.beyond(loop)):
         raise DesignFailed(None, (), f"{condition}: {reason}")
     if chosen is KNOWN_DEVICE:
         return _for_known_devices(loop, band_hz)
