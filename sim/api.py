@@ -263,7 +263,6 @@ def validate(
         TypeError: An argument has the wrong type.
     """
     from haptic_loop.sim import crowds  # loads multiprocessing
-    from haptic_loop.sim.crowds import validate as validate_all
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen = _chosen(scenario, coupling)
@@ -282,4 +281,4 @@ def validate(
     lag = assessed(alone, "I", chosen, limiter=None if limiter else False).force_limits.rho
     work = (humans, links, engine, duration)
     question = crowds.Validation(scenario, chosen.coupling, seed, *work, lag=lag, all_traces=traces == "all")
-    return validate_all(question, shards, progress)
+    return crowds.validate(question, shards, progress)

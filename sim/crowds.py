@@ -1,7 +1,7 @@
 """Validate a loop with many random passive humans, by two engines, in batches that several processes may share.
 
 A set has one human for each device. The humans of set i depend on the scenario, the seed and the number of links, and
-not on other sets. The batches do not depend on the number of processes, so that any number gives the same bits.
+not on other sets. The batches do not depend on the number of processes, so that the findings do not, either.
 
 The first engine is the exact one, which simulates all sets. The second engine is MuJoCo or a user's own, and simulates
 all sets or a sample (`_witnessed`). MuJoCo's verdict comes from the map of its RK4 integrator over one period, the

@@ -1,4 +1,4 @@
-"""Z-width maps: which stiffness K and damping B is safe, by certificates, with random humans, and in simulations.
+"""Z-width maps: which stiffness K and damping B are safe, by certificates, with random humans, and in simulations.
 
 With `CouplingSweep` K and B are the gains of a spring-damper coupling on every channel, in one environment or against a
 rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B are those of every spring at a contact. A cell is
