@@ -75,7 +75,7 @@ class EngineSettings:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """The computer's process and the plant of a scenario with its coupling, ready to run."""
+    """The controller (`process`) and the plant of a scenario with its coupling, ready to run."""
 
     scenario: Scenario
     coupling: Coupling
@@ -308,10 +308,8 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     first = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
-        engine.run_block(
-            ticks
-        )  # The engine ignores force limits; `linear_until` returns the first tick that violates one.
-        first = buffer.linear_until(ticks)
+        engine.run_block(ticks)  # This ignores force limits.
+        first = buffer.linear_until(ticks)  # the first tick whose forces exceed a limit
         if first == ticks:
             return
         engine.back(first)
