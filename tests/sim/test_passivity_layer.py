@@ -226,8 +226,8 @@ def test_energy_accounts_refuse_a_latency_before_computing(capsys, monkeypatch, 
     late = SHORT.replace(latency=((0.0, 1e-4),) * 2)
     with pytest.raises(InputError, match="an energy account assumes forces that latch at ticks"):
         netted(assemble(late, NoCoupling()), EnergyNet(0.0))
-    for module in "cli.verdict", "sim.api":
-        monkeypatch.delattr(f"haptic_loop.{module}.assessed")
+    for name in "cli.verdict.assess", "sim.api.assessed":
+        monkeypatch.delattr(f"haptic_loop.{name}")
     with pytest.raises(InputError, match="latency"):
         simulate(late, energy_budget=0.0)
     for loop in ["--energy-budget", "0.01"], ["--scenario", "world-cube"]:
