@@ -31,7 +31,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
 from haptic_loop.hw.encoders import EncoderMonitor, EncoderTest, Expected
-from haptic_loop.hw.limits import Heat, SafetyLimits, Units, largest_pulse
+from haptic_loop.hw.limits import Heat, SafetyLimits, Units, largest_pulse, next_gain
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
 from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.couplings import assessed, choose, given
@@ -356,9 +356,9 @@ class Drive:
             test = self._test.force(state, ticks) if self._test else None
             if test is None:
                 self._test = None
-                self.gain = self.limits.next_gain(self.gain, ticks * self.T)
+                self.gain = next_gain(self.gain, ticks * self.T)
         elif direction < 0:
-            self.gain = self.limits.next_gain(self.gain, -ticks * self.T)
+            self.gain = next_gain(self.gain, -ticks * self.T)
             if closing and self._last_test and self.gain == 0:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain == 0 and test is None

@@ -26,6 +26,7 @@ _FEWEST_STEPS = 16  # least number of force steps up to the cap; fewer steps mak
 _COARSEST = 0.1  # coarsest encoder step, as a share of the largest displacement in a tick (`jump`)
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
+_RAMP_IN, _RAMP_OUT = 0.25, 0.1  # [s] times in which the gain rises from 0 to 1, and falls back
 _HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last force; then a ramp [us]
 
 
@@ -73,8 +74,6 @@ class SafetyLimits:
     slew: float = 2000.0  # [N/s] fastest change of a force
     jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
-    ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
-    ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
     #: [m/s] fastest motion while forces act; under 2 N and with a drifting encoder, a handle then stays below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
@@ -89,8 +88,6 @@ class SafetyLimits:
         require("slew", self.slew, 1.0 * r, 2000.0 * r, "N/s")
         require("jump", self.jump, 1e-6 / r, 3e-3 / r, "m")
         require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
-        require("ramp_in", self.ramp_in, 0.1, 0.25, "s")
-        require("ramp_out", self.ramp_out, 0.1, 0.25, "s")
         require("speed", self.speed, 1e-3 / r, 2.5 / r, "m/s")
         require("thermal", self.thermal, 0.1, 1000.0, "s")
         if self.continuous and len(self.continuous) != len(self.cap):
@@ -147,13 +144,6 @@ class SafetyLimits:
         for first, end in self.vectors:
             size[:, first:end] = (1 + _ROUNDED) * np.linalg.norm(forces[:, first:end], axis=1, keepdims=True)
         return size >= at * np.array(self.cap)
-
-    def next_gain(self, gain: float, seconds: float) -> float:
-        """Return the gain after `seconds` of its linear rise to 1, or, if negative, of its fall to 0.
-
-        Any constant gain g within [0, 1] preserves a certificate: if this-environment holds for F, it holds for g F.
-        """
-        return min(1.0, gain + seconds / self.ramp_in) if seconds > 0 else max(0.0, gain + seconds / self.ramp_out)
 
     def check_jump(self, x: Sequence[float], previous: Sequence[float], ticks: int) -> None:
         """Raise SafetyStop where no hand can have moved an axis from `previous` to x (m,) [m] in `ticks` ticks."""
@@ -232,10 +222,18 @@ class SafetyLimits:
             theta=theta,
             hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),
             ramp=ramp,
-            ramp_in=min(0xFFFF, math.ceil(1e9 * self.ramp_in / T_ns)),
+            ramp_in=min(0xFFFF, math.ceil(1e9 * _RAMP_IN / T_ns)),
             cap=tuple(map(min, info.hard_limit, most)),
             slew=tuple(slew),
         )
+
+
+def next_gain(gain: float, seconds: float) -> float:
+    """Return the gain after `seconds` of its linear rise to 1, or, if negative, of its fall to 0.
+
+    Any constant gain g within [0, 1] preserves a certificate: if this-environment holds for F, it holds for g F.
+    """
+    return min(1.0, gain + seconds / _RAMP_IN) if seconds > 0 else max(0.0, gain + seconds / _RAMP_OUT)
 
 
 @lru_cache(maxsize=4096)

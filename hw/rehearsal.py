@@ -121,8 +121,7 @@ class Rehearsal:
     faults: tuple[FaultInjection, ...] = ()
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
-    arm: bool = True  # whether to arm the first coupling; a softer coupling waits for a person
-    operator: Operator | None = None  # decides in place of `arm`, as in a live session
+    operator: Operator | None = None  # as in a live session; None arms the first coupling, but no softer one
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # length of the device's tick as a multiple of T
     keep: bool = True  # whether to record every tick of every device in `moments`
@@ -194,7 +193,7 @@ class Rehearsal:
                 self._driver.do(call(session, now))
         if self.operator:
             self._driver.do(self.operator.decide(session, now))
-        elif session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
+        elif session.stage == Stage.DISARMED and session.program is session.programs[0]:
             if session.hindrance:
                 return self.watch(session)
             self._driver.do(session.arm(now))

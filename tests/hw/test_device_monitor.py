@@ -10,7 +10,7 @@ from shared import FakePort, checkered
 
 from haptic_loop.design.files import plain
 from haptic_loop.hw.device_state import Device
-from haptic_loop.hw.driver import Driver
+from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.identify import chirp
@@ -112,7 +112,7 @@ def test_a_disarmed_device_has_no_force():
 
 def test_a_session_stops_where_a_disarmed_device_pushes(scenario, link_couplings):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, arm=False).run(0.5)
+    Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, operator=Operator(False, 1.0)).run(0.5)
     assert session.stage == Stage.DISARMED
     last = session.link.last
     assert last

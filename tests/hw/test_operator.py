@@ -97,7 +97,7 @@ def test_other_keys_do_nothing(scenario, link_couplings):
 def test_sessions_that_never_armed_have_not_finished(scenario, link_couplings, encoders):
     settings = LinkSettings(measure=100, test_encoders=encoders)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
-    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, arm=False)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: link_couplings, operator=Operator(False, 1.0))
     assert rehearsal.run(0.3).stage == Stage.DISARMED
     Operator(False, 5.0).press("q", session, session.now)
     assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")

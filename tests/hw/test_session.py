@@ -19,7 +19,7 @@ from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.hw.control import BudgetPlan, SentBudget, _HostController, certified_coupling, certified_couplings
-from haptic_loop.hw.driver import Driver
+from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
@@ -189,7 +189,7 @@ def test_devices_that_contradict_the_session_are_stopped(harmless, change, cause
 
 
 def test_a_device_that_arms_by_itself_is_stopped(scenario, link_couplings):
-    rehearsal = rehearsal_of(scenario, link_couplings, arm=False)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=Operator(False, 1.0))
     session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     last = session.link.last
@@ -199,7 +199,7 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, link_couplings):
 
 
 def test_without_arming_no_force_is_ever_asked_for(scenario, link_couplings):
-    rehearsal = rehearsal_of(scenario, link_couplings, arm=False)
+    rehearsal = rehearsal_of(scenario, link_couplings, operator=Operator(False, 1.0))
     rehearsal.emulator.plant.begin()  # the person still moves
     sent = []
     receive = rehearsal.emulator.receive
