@@ -143,8 +143,8 @@ _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] time in which the hand's force grows to its constant value
 _START = 1e-3  # [m] initial displacement of the motor or handle that moves most
 _BLOCK = 64  # ticks between two calls of `progress`
-DECIDED = 0.2  # [1/s] A trace is too short to show the sign of a smaller growth rate.
-UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear loop's rate is at most DECIDED
+_DECIDED = 0.2  # [1/s] A trace is too short to show the sign of a smaller growth rate.
+UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear loop's rate is at most _DECIDED
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
@@ -186,7 +186,7 @@ class Points:
     @property
     def near(self) -> NDArray[np.bool_]:
         """(k,) whether the linear loop grows or decays so slowly that its motion looks like a limit cycle."""
-        return np.abs(self.growth) <= DECIDED
+        return np.abs(self.growth) <= _DECIDED
 
     @property
     def differ(self) -> NDArray[np.bool_]:

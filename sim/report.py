@@ -240,7 +240,7 @@ class UnevenTicks:
         return cls(lengths, recorded, scenario.longest_period, scenario.latency)
 
 
-def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
+def _switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
     """Return the verdict on a run whose delays switch, so that eigenvalues of a single tick decide nothing."""
     met = delays.met
     assert met is not None
@@ -367,7 +367,7 @@ def run_report(
     if simulation.scenario.varying_delay:
         delays = VaryingDelays.of(simulation, assessment, chosen.switching, run.period, trace.t.size)
     if delays and delays.met:
-        stability = switched_stability(simulation, trace, delays)
+        stability = _switched_stability(simulation, trace, delays)
         grows = stability.verdict == "unstable"
     else:
         stability = stability_of(simulation, trace)

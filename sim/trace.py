@@ -4,9 +4,9 @@ Oscillations are judged by displacements alone, because a session on a device an
 a nonlinear loop has no eigenvalues. The slow motion is subtracted, and the rest is split into octaves.
 
 oscillation   Does an oscillation last in the second half of a trace? The half is cut into two windows. The oscillation
-              lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
-              times the amplitude in the first window. Octaves are judged separately, so that a slow mode that decays
-              does not hide a fast mode that grows.
+              lasts if in some octave the amplitude in the last window exceeds a threshold and is at least 95 % of
+              the amplitude in the first window. Octaves are judged separately, so that a slow mode that decays does
+              not hide a fast mode that grows.
 growth        How fast does an oscillation grow? If it grows like exp(g t), the logarithm of the amplitude over the
               windows is a line of slope g. The slope describes a motion and is no verdict on a loop: the motion of a
               person who shakes the handle harder and harder grows, too.
@@ -219,7 +219,7 @@ class Trace(ReadOnly):
 
 _PERIODS = 4  # least number of periods in a window; with fewer periods the window mixes neighbouring octaves
 _TREND = 7  # degree of the polynomial of the slow motion; in 1 s it leaves 1 um of a motion of 15 mm at 0.6 Hz
-SUSTAINED = 0.95  # least ratio of amplitudes, last window over first window, of an oscillation that lasts
+_SUSTAINED = 0.95  # least ratio of amplitudes, last window over first window, of an oscillation that lasts
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
@@ -244,7 +244,7 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     calm = np.where(diverged, 0.0, x)
     before, _, _ = _octaves(calm[:half], T)
     after, line, _ = _octaves(calm[half : 2 * half], T)  # (octaves, m, nsim)
-    lasting = (after > threshold) & (after >= SUSTAINED * before)
+    lasting = (after > threshold) & (after >= _SUSTAINED * before)
     shown = np.where(lasting | ~lasting.any(axis=(0, 1)), after, 0.0).reshape(-1, x.shape[2])
     at = np.argmax(shown, axis=0)[None]
     amplitude = np.take_along_axis(shown, at, axis=0)[0]

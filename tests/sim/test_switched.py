@@ -25,7 +25,7 @@ from haptic_loop.models.scene import Crowd, plant, variants
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.crowds import _batch
 from haptic_loop.sim.engines import ExactEngine
-from haptic_loop.sim.report import DelaySpan, VaryingDelays, _DelaysMet, _PeriodGrowth, switched_stability
+from haptic_loop.sim.report import DelaySpan, VaryingDelays, _DelaysMet, _PeriodGrowth, _switched_stability
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
@@ -310,7 +310,7 @@ def test_own_or_worst_delays_decide_instability(own, worst):
     met = _DelaysMet(None, [0, 0], [0, 0], 0.5, own, 4.0, _PeriodGrowth(3, -0.5, 0.9, worst))
     trace = close_loop(ASSEMBLY, "exact", ticks=20)
     delays = VaryingDelays(DelaySpan((1,), (2,), "", 0, False, False), met, None)
-    verdict = switched_stability(ASSEMBLY, trace, delays).verdict
+    verdict = _switched_stability(ASSEMBLY, trace, delays).verdict
     assert verdict == ("unstable" if "unstable" in (own, worst) else "stable")
 
 
