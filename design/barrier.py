@@ -3,8 +3,9 @@
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
 The log-det barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is
-strictly feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k.
-`follow` steps along this path by power series, because products cost little beside the factor of a Hessian.
+strictly feasible, and its objective is at most degree/t above the minimum, where degree is the sum of the numbers of
+rows of the S_k. `follow` steps along the path x(t) by power series. The terms of a series cost much less than the
+Cholesky factor of a Hessian.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
 _CENTRED = 0.5  # largest squared Newton decrement of a point that counts as the minimiser x(t)
-_STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a step, and of each of its products
-_ORDER = 6  # terms of the series: with 4 terms, n6 and n7 of benchmarks/loops take 5 to 10 % more steps
+_STEP, _PRODUCT = 3e-4, 1e-10  # counted work of a step, and of each of its products
+_ORDER = 6  # terms of the series; with 4 terms, n6 and n7 of benchmarks/loops take 5 to 10 % more steps
 _KEPT = 0.05  # least share of every eigenvalue of S that remains after a step to a larger t
 _DESCENT = 0.1  # least decrease of the barrier function in a step to the same t, relative to its slope at the start
-_FAR = 10.0  # A point with a larger squared Newton decrement, relative to the degree, is moved at a smaller t first.
+_FAR = 10.0  # If the squared Newton decrement is larger than this times the degree, t is reduced before the next step.
 _SHORTER, _SHORTEST = 0.8, 1e-4  # factor by which a refused step is shortened, and length at which it is given up
-_RIDGE = 1e-9  # relative ridge, for directions on which neither objective nor inequalities depend
+_RIDGE = 1e-9  # relative ridge for directions that change neither the objective nor the inequalities
 _upper = cache(np.triu_indices)
 
 
 @dataclass(frozen=True, eq=False)
 class MatrixInequality:
-    """constant + sum_a x_a slope_a > 0 at k frequencies; the matrices are stored as real vectors (`packed`)."""
+    """constant + sum_a x_a slope_a > 0 at k frequencies. The matrices are stored as real vectors (`packed`)."""
 
     constant: Array  # (k, r^2)
     slope: Array  # (k, r^2, n)
@@ -52,7 +53,7 @@ class MatrixInequality:
 
     @property
     def products(self) -> int:
-        """The approximate number of products in a Newton step."""
+        """The approximate number of products of numbers in a Newton step."""
         k, square, n = self.slope.shape
         return k * square * n * (square + n)
 
@@ -90,18 +91,19 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The methods are those of MatrixInequality, but `add_hessian` adds the upper triangle of the Hessian only.
+    The methods are those of MatrixInequality, but `add_hessian` adds only the upper triangle of the Hessian.
     The unknowns are the entries of the X_n, sorted by entry and then by n, followed by the x_a. At each frequency the
-    second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
-    S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)
-    times (pairs of entries).
+    second derivative by an entry of X_n and an entry of X_l is a sum of the products t_n t_l and t_n t_l*. The weights
+    of these products depend on S^-1 and the two entries, but not on n and l. So the Hessian is a product of two
+    matrices whose common dimension is the frequency. One matrix has a row for each pair of functions, and the other has
+    a column for each pair of entries.
     """
 
-    constant: Array  # (k, r^2): `packed`
-    functions: Complex  # (k, n)
+    constant: Array  # (k, r^2) `packed`
+    functions: Complex  # (k, n) t_n at each frequency
     left: Complex  # (k, r, r)
     right: Complex  # (k, r, r)
-    slope: Array  # (k, r^2, a): `packed`
+    slope: Array  # (k, r^2, a) `packed`
 
     @property
     def degree(self) -> int:
@@ -125,7 +127,11 @@ class EntryInequality:
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """All pairs of functions t, u: two indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
+        """All pairs of functions t and u.
+
+        The parts are the two indices of each pair, [Re tu, Im tu, Re tu*] as (n (n + 1)/2, 3 k), and Im tu* as
+        (n (n + 1)/2, k).
+        """
         first, second = _upper(self.functions.shape[1])
         t, u = self.functions.T[first], self.functions.T[second]
         along, against = t * u, t * np.conj(u)
@@ -137,7 +143,7 @@ class EntryInequality:
         return _unpacked(np.swapaxes(self.slope, 1, 2))
 
     def along(self, W: Complex) -> Array:
-        """Return sum_k <W_k, derivative of S_k> for Hermitian matrices W (k, r, r), as (unknowns,)."""
+        """Return sum_k <W_k, derivatives of S_k> for Hermitian matrices W (k, r, r), as (unknowns,)."""
         return self._along(W[:, None])[:, 0]
 
     def _along(self, W: Complex) -> Array:
@@ -164,12 +170,12 @@ class EntryInequality:
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
         size = r * r * n
         hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] += between
-        # The inner products of S^-1 slope_a S^-1 with the derivatives of S.
+        # Mixed derivatives: the inner products of S^-1 slope_a S^-1 with the derivatives of S by all unknowns.
         hessian[:, size:] += self._along(P[:, None] @ self._own @ P[:, None])
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
-    """Join the inequalities into one block for each matrix size."""
+    """Return the inequalities as one block for each matrix size."""
     sizes = dict.fromkeys(block.constant.shape[1] for block in blocks)
     alike = [[block for block in blocks if block.constant.shape[1] == size] for size in sizes]
     return tuple(
@@ -209,10 +215,10 @@ class Program:
         return all(_definite(block.at(x)) for block in self.blocks)
 
     def conditioned(self, x: Array) -> tuple[Program, Array]:
-        """Return the program in y = U x, and the upper triangular U that balances objective and barrier at x.
+        """Return the program in the unknowns y = U x, in which it is well-conditioned at x, and U (upper triangular).
 
-        U is the factor R of a QR decomposition of the stacked rows of objective and barrier. A Cholesky factor of the
-        inner products would lose digits, because the coordinates x of a basis of filters are ill-conditioned.
+        U is the factor R of a QR decomposition of the stacked rows of objective and barrier. A Cholesky factor of their
+        inner products would lose digits, because the unknowns x of a basis of filters are ill-conditioned.
         """
         dense = [block for block in self.blocks if isinstance(block, MatrixInequality)]
         assert len(dense) == len(self.blocks)
@@ -227,7 +233,7 @@ class Program:
 
 
 # ----------------------------------------------------------------------------------------------------
-# LAPACK's routines as scipy.linalg calls them, bit for bit, without the import of its Python code (`compiled`).
+# LAPACK's routines. They give the same bits as scipy.linalg, whose import takes 0.1 s (`compiled`).
 
 
 def _lapack(name: str) -> Any:
@@ -260,8 +266,8 @@ def follow(
 ) -> Iterator[tuple[Array, float]]:
     """Yield points (x(t), t) of the central path, from a strictly feasible x and a first t.
 
-    `onward` returns the next t for a point of the path, or the same t if the path ends there. Where rounding prevents
-    a smaller Newton decrement, the last point counts as x(t).
+    `onward` returns the next t for a point of the path, or the same t to end the path there. If rounding prevents a
+    smaller Newton decrement, the last point counts as x(t).
     """
     aim, steps = t, 0
     while True:
@@ -282,7 +288,7 @@ def follow(
 
 
 class _Expanded:
-    """The equation of the path at (x, t), grad |A x - b|^2 + c - (1/t) grad log det S = 0, and its solution nearby."""
+    """The equation of the path, grad |A x - b|^2 + c - (1/t) grad log det S = 0, expanded at (x, t)."""
 
     def __init__(self, program: Program, x: Array, t: float) -> None:
         spend(program.step_cost)
@@ -303,9 +309,9 @@ class _Expanded:
     def moved(self, to: float) -> tuple[Array, float]:
         """Return the point that a step towards x(to) reaches, and its t.
 
-        The curve x(s) satisfies the equation of the path with the residual (1 - s) times that at x(0), and with 1/t
-        linear in s, so that x(1) = x(to). `_terms` is its power series. The length s is the largest one at which the
-        barrier function decreases, or, towards a larger t, at which S remains well inside the cone.
+        The step is along a curve x(s), 0 <= s <= 1. On it the residual of the path's equation is (1 - s) times that at
+        the start, and 1/t is linear in s, so that x(1) = x(to). `_terms` returns its power series. Lengths s are tried
+        from 1 downwards, until the barrier function decreases, or, for a larger t, until S is well inside the cone.
         """
         change, s = self._t / to - 1, 1.0
         terms, moves = self._terms(change)
@@ -323,11 +329,11 @@ class _Expanded:
         return self._x, to
 
     def _terms(self, change: float) -> tuple[Array, list[Complex]]:
-        """Return the terms of x(s), (order + 1, n), and those of S(x(s)) in each block, (order + 1, k, r, r).
+        """Return the terms of x(s), (_ORDER + 1, n), and those of S(x(s)) in each block, (_ORDER + 1, k, r, r).
 
-        `change` is that of 1/t, relative to 1/t. With S = sum S_j s^j, the series P of S^-1 has the terms
-        P_j = -P_0 sum_i>0 S_i P_j-i. The part of P_j without x_j, and the change of 1/t times P_j-1, are the right side
-        of the equation for x_j, whose matrix is the Hessian.
+        `change` is the change of 1/t along the whole curve, relative to 1/t. With S = sum S_j s^j, the series of
+        P = S^-1 has the terms P_j = -P_0 sum_i>0 S_i P_j-i. The equation for x_j has the Hessian as its matrix. Its
+        right side contains the part of P_j without x_j, and `change` times P_j-1.
         """
         blocks, right = self._program.blocks, -self._residual
         terms, S, P = [self._x], [[S] for S in self._S], [[P] for P in self._P]
@@ -353,7 +359,10 @@ class _Expanded:
 
 
 def _scaled_factor(hessian: Array) -> tuple[Array, Array]:
-    """Return (scale, Cholesky factor of the Hessian times the scale from both sides); a ridge grows until it exists."""
+    """Return (scale, Cholesky factor of the Hessian times the scale from both sides).
+
+    The scale (n,) makes the diagonal 1. If rounding prevents the factor, a growing ridge is added to the diagonal.
+    """
     scale = 1 / np.sqrt(np.diag(hessian))
     hessian *= scale[:, None]
     hessian *= scale

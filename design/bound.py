@@ -1,23 +1,24 @@
 """Compute a lower bound on the transparency error of all linear couplings that this-environment certifies.
 
-python -m design prints it for an optimal coupling. The bounded couplings may have any order. docs/theory.md has the
-derivation ("Every linear coupling is a filter"): every dual feasible point gives a lower bound.
+python -m design prints the bound for an optimal coupling. The bound holds for couplings of any order. docs/theory.md
+has the derivation ("Every linear coupling is a filter"): every feasible point of the dual problem gives a lower bound.
 
-For a certified F, S = He P of P(z) = Delta + T F(z)/(z-1) is a positive measure sum_k s_k z^-k on the circle, and
-s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because no force has
-arrived yet). Let <X, Y> be the mean of Re tr X*Y over the circle, and rho(w) the weight with which J = <M, rho M> is
-the mean square of the relative mismatch over the band, M = F - Lambda E. Let H(z) vanish outside the band, and let C_k
-weigh only the zero combinations, such that
+For a certified F let P(z) = Delta + T F(z)/(z-1). S = He P is a positive measure sum_k s_k z^-k on the circle, and
+s_0 = Delta. Because of the delays some combinations of the first s_k are zero: for 1 <= k <= theta_i no force has
+arrived at device i yet, so that row i of s_k is zero. Let <X, Y> be the mean of Re tr X*Y over the circle. With
+M = F - Lambda E and a weight rho(w), J = <M, rho M> is the mean square of the relative mismatch over the band. Let H(z)
+vanish outside the band, and let the C_k multiply only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
 Then <D, S> >= 0 means that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With H = rho |E| h this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
 D >= 0, which lowers the bound on J. The bound on J is then proved.
-The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero
-and the estimate is not, or the psi of the channels differ, so that the zero combinations are known up to rounding only.
-The integrals over the band are computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) is
-subtracted from the proved bound, and _QUADRATURE from both.
+
+In two cases the result is only an estimate, for which D is positive at the frequencies of a sweep. In the first case
+the proved bound is zero, but the estimate is not. In the second case the psi of the channels differ, so that the zero
+combinations are known only up to rounding. The integrals over the band are computed by Gauss's rule. A bound of the
+rule's error (`_Dual.objective_again`) is subtracted from the proved bound, and _QUADRATURE from both results.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels, in_band
 
-_GRID = 250  # points of the grid with equal steps, and as many with equal ratios; H is linear between grid points
+_GRID = 250  # The grid has this number of points with equal steps, and as many with equal ratios.
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h, even in log frequency
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} channels: it would take half a minute and be 1 dB off"
@@ -51,29 +52,29 @@ _NEAR_END = (0.22, 0.5)  # distances of further knots from the band's ends, wher
 _NEAR_MODE = 1.0  # distance of further knots from a mode, in widths of the mode
 _CLOSEST = 0.1  # least distance of two knots, in steps of even knots
 _MOST_ADDED = 96  # largest number of frequencies that one check of D adds
-_AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # ratios of frequencies around the band's ends, where D bends
+_AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # ratios of further frequencies to the band's ends, where D bends
 _AROUND = np.array(
     [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
-)  # distances of frequencies from a mode, in widths of the mode
+)  # distances of further frequencies from a mode, in widths of the mode
 _DEGREE = 3  # degree of the splines of h
 _FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objective, and the factor by which t grows
-_GAP = 0.004  # largest gap to the optimum at which the barrier method ends, relative to the bound
-_LEAST = 1e-9  # mean square below which a bound is useless
-_WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative to the bound
-_QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimate's rule has no error bound
+_GAP = 0.004  # The barrier method ends at this gap to the optimum, relative to the bound on J.
+_LEAST = 1e-9  # A smaller bound on J is useless.
+_WANTED = 1e-3  # wanted error of the lower bounds of D between frequencies, relative to the bound on J
+_QUADRATURE = 1e-8  # It is always subtracted from the bound on J, because the estimate's rule has no error bound.
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # Gauss's rule in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53  # unit roundoff of double precision
-_LARGEST_CHARGE = 0.005  # The search ends if the bound is below the barrier's value by less than this share.
+_LARGEST_CHARGE = 0.005  # The search ends if the bound on J is below the barrier's value by less than this share.
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A lower bound of the rms mismatch of couplings that this-environment certifies; an estimate unless `proved`."""
+    """A lower bound of the rms mismatch of all couplings that this-environment certifies, or an estimate of it."""
 
     rms: float  # relative to the environment
     proved: bool  # whether D >= 0 is proved on the whole circle; True for a bound of 0, which needs no proof
-    sampled_rms: float  # the estimate from samples alone
+    sampled_rms: float  # estimate for which D is positive at the frequencies of a sweep
 
     @property
     def rms_db(self) -> float:
@@ -81,11 +82,11 @@ class Bound:
 
 
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> Bound:
-    """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
+    """Return a lower bound, or its estimate, of the rms mismatch of all couplings that this-environment certifies.
 
-    The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
-    T_max are replaced by even periods with less damping. With a latency of at least t1, Delta T/(T_max - t1) is the
-    damping (docs/theory.md).
+    The loop has at most MOST channels. `knots` is the number of knots of h; None is that of _KNOTS. Varying periods up
+    to T_max are replaced by the period T with less damping. With a latency of at least t1 the damping is
+    Delta T/(T_max - t1) (docs/theory.md).
     """
     level = even_level(loop)
     if loop.latency:
@@ -102,17 +103,17 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
 
 @dataclass(frozen=True, eq=False)
 class _Dual:
-    """The dual problem. Its unknowns are h (entry by entry, real parts, then imaginary parts), C_0 and the C_k.
+    """The dual problem. Its unknowns x are h (for each entry its real and then its imaginary parts), C_0 and the C_k.
 
-    D is in units of 1/delta. H is piecewise linear between the points of `grid`, which gives closed forms (`_causal`).
+    D is in units of 1/delta. H is linear between the points of `grid`, so that H_+ has a closed form (`_causal`).
     """
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner): basis functions of H on the grid; the basis functions of h are orthonormal on the band
+    heights: Array  # (k, inner) basis functions of H on the grid; those of h are orthonormal on the band
     target: Array  # (2 inner, m^2) coefficients of -Lambda E/|E| in the functions of h, real and then imaginary parts
-    knots: Array  # [rad/sample] of the splines h
-    forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
+    knots: Array  # [rad/sample] knots of the splines h
+    forbidden: tuple[tuple[int, Array], ...]  # sums that are zero for every F: (row of the s_k, weights (k, m))
     exact: bool  # whether these sums are exactly zero, not only up to rounding
     band: tuple[float, float]  # [rad/sample]
 
@@ -160,13 +161,13 @@ class _Dual:
         return np.concatenate([np.zeros(m * m * len(self.target)), each, np.zeros(len(self.forbidden))])
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c with -2 <H, Lambda E> - <H, H/rho> = |b|^2 - |A x - b|^2; c is `cost`."""
+        """Return A, b, c such that |b|^2 - |A x - b|^2 - c'x is the bound on J; c is `cost`."""
         return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.cost
 
     def imposed(self) -> Array:
-        """Return the first frequencies at which D > 0 is imposed.
+        """Return the frequencies [rad/sample] at which D > 0 is imposed first.
 
-        They are dense at the band's ends and the modes of E, and include the zeros of the delays' windows (`turns`).
+        They are dense at the band's ends and at the modes of E. `turns` are the zeros of 1 + .. + z^-theta_i.
         """
         low, high = self.grid[0], self.grid[-1]
         steps = np.arange(4 * self.knots.size - 3) / 4
@@ -181,14 +182,14 @@ class _Dual:
         return w[w <= np.pi]
 
     def swept(self) -> Array:
-        """Return the frequencies at which D > 0 is checked after each round."""
+        """Return the frequencies [rad/sample] at which D > 0 is checked after each round."""
         low, high = self.grid[0], self.grid[-1]
         beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
         swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
         return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
-        """Return D's slopes in the unknowns of C_0 and the C_k, (k, unknowns, m, m); D takes their Hermitian part."""
+        """Return matrices (k, unknowns, m, m) whose Hermitian parts are the derivatives of D by C_0 and the C_k."""
         m, z = self.loop.channels, on_circle(w)
         triangle = _triangle(m)
         slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
@@ -207,7 +208,7 @@ class _Dual:
         return EntryInequality(np.zeros(further.shape[:2]), functions, root, root, np.ascontiguousarray(further))
 
     def matrix(self, x: Array) -> DualMatrix:
-        """Return D at the point x in a form that can be bounded between frequencies."""
+        """Return D at the point x as a DualMatrix, which has bounds between frequencies."""
         m, root = self.loop.channels, np.sqrt(np.asarray(self.loop.delta))
         own, triangle = x[m * m * len(self.target) :], _triangle(m)
         sums = np.zeros((1 + max((len(weights) for _, weights in self.forbidden), default=0), m, m))
@@ -225,10 +226,10 @@ class _Dual:
 
     @cached_property
     def _nodes(self) -> tuple[Array, Array, Complex, Array]:
-        """The intervals of Gauss's rule: (middles (k,), half-widths (k,), Lambda E at the points, bounds (2, k)).
+        """The intervals of Gauss's rule: (middles (k,), half-widths (k,), Lambda E (k, points, m, m), bounds (2, k)).
 
-        Lambda E has the shape (k, points, m, m). The bounds are those of |Lambda E| in the disk of _DISK half-widths
-        around the middle, and of its rounding.
+        The first row of the bounds is for |Lambda E| in the disk of _DISK half-widths around the middle, and the second
+        for the rounding errors of Lambda E.
         """
         E, half = self.loop.E(), np.diff(self.grid) / 2
         middle, nodes = self.grid[:-1] + half, []
@@ -250,13 +251,13 @@ class _Dual:
         return middle, half, response, bounds
 
     def objective_again(self, x: Array) -> tuple[float, float]:
-        """Return (the bound on J from the point x, its largest error). The integrals of H are computed by Gauss's rule.
+        """Return the bound on J from the point x by Gauss's rule, and its largest error.
 
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
-        linear there; span is log(high/low) of the band. Gauss's rule of N points is exact for polynomials up to the
-        degree 2N - 1, and its weights are positive. Its error is at most twice the length times the distance of g from
-        such a polynomial. The distance from the Taylor polynomial around the middle is at most q^2N/(1 - q) times the
-        maximum of |g| on the disk of radius half-width/q.
+        linear there. Here span is log(high/low) of the band. Gauss's rule of N points is exact for polynomials up to
+        the degree 2N - 1, and its weights are positive. So its error is at most twice the length of the interval times
+        the distance of g from such a polynomial. The distance from the Taylor polynomial around the middle is at most
+        q^2N/(1 - q) times the maximum of |g| on the disk of radius half-width/q.
         """
         middle, half, response, (size, error) = self._nodes
         low, high = self.band
@@ -277,9 +278,10 @@ class _Dual:
         return -value - float(self.cost @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
-        """Return (the bound on J from x with C_0 increased, frequencies at which D was evaluated, least eigenvalues).
+        """Return the proved bound on J from x after an increase of C_0, and the least eigenvalues of D.
 
-        The bound on J is 0 if the forbidden sums are zero up to rounding only.
+        The results are (bound, frequencies at which D was evaluated, its least eigenvalues there). `value` is the bound
+        without the increase. The proved bound is 0 if the forbidden sums are zero only up to rounding.
         """
         if not self.exact:
             return 0.0, swept, np.zeros(swept.size)
@@ -290,7 +292,7 @@ class _Dual:
     def best(self) -> tuple[float, float]:
         """Return two bounds on J: an estimate with D >= 0 at samples, and a bound with D >= 0 on the whole circle.
 
-        The points are taken from the barrier's path. After each round, frequencies are added at which D is negative.
+        Both come from points of the barrier's path. After each round, frequencies are added at which D is negative.
         """
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
@@ -329,7 +331,7 @@ class _Dual:
 
 
 def _splines(x: Array, knots: Array, degree: int) -> Array:
-    """Return the B-splines over the knots at x, (k, knots + degree - 1), without SciPy, whose import is slow."""
+    """Return the B-splines over the knots at x, (k, knots + degree - 1). SciPy's splines would be slow to import."""
     place = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2) + degree
     t = np.concatenate([[knots[0]] * degree, knots, [knots[-1]] * degree])
     x, splines = np.clip(x, knots[0], knots[-1])[:, None], np.eye(t.size - 1)[place]
@@ -348,10 +350,10 @@ def _gauss(grid: Array) -> tuple[Array, Array, Array]:
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
-    """Return a point near x, on the line to `inner`, at which no least eigenvalue is negative, or None.
+    """Return a point on the line from x to `inner` at which no least eigenvalue is negative, or None.
 
-    `room` and `lacking` are the least eigenvalues at `inner` and at x. They are concave on the line, so that linear
-    interpolation bounds them from below.
+    `room` and `lacking` (k,) are the least eigenvalues at `inner` and at x, for each frequency. They are concave on the
+    line, so that linear interpolation bounds them from below. By these bounds the point is as near to x as possible.
     """
     if room.min() <= 0:
         return None if lacking.min() < 0 else x
@@ -380,16 +382,18 @@ def _modes(E: Lti) -> tuple[Array, Array]:
 
 
 def _triangle(m: int) -> list[tuple[int, int]]:
+    """Return the indices of the upper triangle, row by row."""
     return [(i, j) for i in range(m) for j in range(i, m)]
 
 
 def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]:
-    """Return the sums that are zero because of delays, and whether they are exactly zero.
+    """Return sums over the s_k that are zero because of delays, and whether they are exactly zero.
 
     A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E with a causal R. Row i of
-    s_k is zero for 1 <= k <= theta_i. Later coefficients of F are sums of products of those of R and of Psi E. If the
-    channels' psi differ, these sums lie in a subspace; v is orthogonal to it and is computed as a null space, up to
-    rounding. Only the first steps of long delays are used; any subset of the sums gives a bound.
+    s_k is zero for 1 <= k <= theta_i. Later coefficients of F are sums of products of coefficients of R and of Psi E.
+    If the channels' psi differ, the possible values of the first later coefficients form a subspace. The vectors v that
+    are orthogonal to it are computed as a null space, up to rounding. Any subset of the sums gives a bound, so that
+    only the first steps of long delays are used.
     """
     import scipy
 
@@ -423,11 +427,12 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:
-    """Return (1/z - 1) H_+ + H_0 at z = e^jw for H = a and for H = j a, with H(conj z) = conj H(z), (k, 2 functions).
+    """Return (1/z - 1) H_+ + H_0 at z = e^jw for H = a and then for H = j a, (k, 2 functions).
 
-    Each function a is piecewise linear with these heights on the grid and zero outside. The first and last heights are
-    zero. With sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2). H_+ therefore consists of
-    dilogarithms Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
+    Each function a of the frequency has its `heights` on the grid, is linear between the grid's points, and is zero
+    outside. Its first and last heights are zero. H(conj z) is conj H(z). If sigma_i is the change of a's slope at x_i,
+    H_k = -sum sigma_i cos(k x_i)/(pi k^2) for H = a. So H_+ consists of dilogarithms
+    Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
     """
     slopes = np.diff(heights, axis=0) / np.diff(grid)[:, None]
     bends = np.diff(slopes, axis=0, prepend=0, append=0) / (2 * np.pi)
@@ -439,7 +444,7 @@ def _causal(grid: Array, heights: Array, w: Array) -> Complex:
 
 
 def _worst(lacking: Array, w: Array) -> Array:
-    """Return the frequencies of the highest local maxima above zero."""
+    """Return the frequencies of the highest local maxima above zero, at most _MOST_ADDED."""
     padded = np.concatenate([[-np.inf], lacking, [-np.inf]])
     local = np.flatnonzero((lacking >= padded[:-2]) & (lacking >= padded[2:]) & (lacking > 0))
     return w[local[np.argsort(lacking[local])[-_MOST_ADDED:]]]
@@ -447,9 +452,10 @@ def _worst(lacking: Array, w: Array) -> Array:
 
 @dataclass(frozen=True)
 class BoundBeside:
-    """A bound on couplings of this-environment, and the gap from it to a design; or the reason why there is no bound.
+    """A bound on the couplings that this-environment certifies, and the gap from it to a design.
 
-    The gap is None if the design has further requirements, which the bound neglects, or minimised the supremum.
+    `reason` is the reason why there is no bound, or None. The gap is None if the design has further requirements, which
+    the bound neglects, or if it minimises the supremum.
     """
 
     rms_mismatch_db: float | None = None

@@ -22,12 +22,12 @@ from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: Largest violation that counts as rounding. Problems are scaled so that a violation of 1 would be large.
 _TOLERANCE = 1e-4
-#: Clarabel is slower than `_interior` on a block whose triangle has more than _LARGE entries, and more than _MANY
-#: for each unknown.
+#: Clarabel is slower than `_interior` if the triangle of a block has more than _LARGE entries, and more than _MANY
+#: entries for each unknown.
 _LARGE, _MANY = 300, 4
 
 
-#: The blocks are dense. A search for a chordal decomposition takes a third of the time and finds none.
+#: The blocks are dense. Without this option Clarabel spends a third of its time on a chordal decomposition.
 _DENSE = {"chordal_decomposition_enable": False}
 _TIGHT = {**_DENSE, "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {**_DENSE, "tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
@@ -59,7 +59,7 @@ class Inequality:
 
     @classmethod
     def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
-        """Build function(x[unknowns]) >= 0 from values (n, n) or (k, n, n) of this affine function."""
+        """Return function(x[unknowns]) >= 0 for an affine function with values (n, n) or (k, n, n)."""
         constant, *values = (function(x) for x in np.eye(len(unknowns) + 1, len(unknowns), k=-1))
         slopes = np.stack(values) - constant
         one = constant.ndim == 2
@@ -80,12 +80,12 @@ class Inequality:
 
     @property
     def large(self) -> bool:
-        """Whether Clarabel, whose work grows with the square of a triangle's entries, is slower than `_interior`."""
+        """Whether Clarabel is slower than `_interior`. Its work grows with the square of the triangle's entries."""
         rows = self.constant.shape[-1] * (2 if np.iscomplexobj(self.constant) else 1)
         return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
 
     def rows(self) -> tuple[Array, Array]:
-        """Return constant (k, r) and slopes (q, k, r) as real lower triangles, scaled to keep inner products."""
+        """Return constant (k, r) and slopes (q, k, r) as real lower triangles with the same inner products."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
         i, j = np.tril_indices(constant.shape[-1])
         weight = np.where(i == j, 1.0, np.sqrt(2))
@@ -115,8 +115,8 @@ class ConeProgram:
         Args:
             problem: The name of the problem in error messages.
             accept: A further verification of x.
-            settings: Names of the settings in the order of their trial. Without them, INTERIOR solves a problem with a
-                large block, and SETTINGS are tried for all others.
+            settings: Names of settings in the order in which they are tried. The default is INTERIOR for a problem with
+                a large block, and SETTINGS for all others.
 
         Raises:
             Infeasible: Two settings report that there is no solution.
@@ -135,7 +135,7 @@ class ConeProgram:
         raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 
     def violation(self, x: Array) -> float:
-        """Return minus the least eigenvalue of all blocks; x violates an inequality if it is positive."""
+        """Return minus the least eigenvalue of all blocks. If the result is positive, x violates an inequality."""
         least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
         return float(-min(least, default=np.inf))
 
@@ -159,10 +159,10 @@ class ConeProgram:
 
 
 def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
-    """Minimise cost'x with s = constant + slopes x in its cone; return x and Clarabel's status."""
+    """Solve the problem by Clarabel; return x and Clarabel's status."""
     import clarabel
 
-    for name in ("cython_blas", "cython_lapack"):  # Clarabel calls their functions.
+    for name in ("cython_blas", "cython_lapack"):  # Clarabel calls functions of these modules.
         compiled(f"scipy.linalg.{name}")
     constants, entries, cones, p, height = [], [], [], len(problem.cost), 0
     for block in problem.blocks:
@@ -191,7 +191,10 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 
 
 def _columns(shape: tuple[int, int], starts: Any, rows: Any, values: Array) -> Any:
-    """Return the matrix as far as Clarabel reads it, without the import of scipy.sparse, which would take 0.1 s."""
+    """Return a sparse matrix by columns, with the attributes of scipy.sparse.csc_matrix that Clarabel reads.
+
+    The import of scipy.sparse would take 0.1 s.
+    """
     return SimpleNamespace(shape=shape, indptr=starts, indices=rows, data=values, has_canonical_format=True)
 
 
@@ -199,21 +202,21 @@ def _columns(shape: tuple[int, int], starts: Any, rows: Any, values: Array) -> A
 # A primal-dual interior-point method for large blocks in few unknowns.
 #
 # The slacks S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a. At the optimum S Z = 0.
-# The equation S Z = mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro). Then
-# <slope_a, Z + dZ> = cost_a gives one equation for each unknown. A predictor with mu = 0 gives the next mu and the
-# second-order term dZ dS (Mehrotra). The start may be infeasible.
+# The equation S Z = mu I is linearised to dZ = mu S^-1 - Z - Z dS S^-1, made Hermitian (Helmberg, Kojima, Monteiro).
+# Then <slope_a, Z + dZ> = cost_a is one equation for each unknown. A first step with mu = 0 determines the next mu and
+# the second-order term dZ dS (Mehrotra). The start may be infeasible.
 
-_GAP = 1e-8  # relative gap and violation at which the iteration ends
-_ENOUGH = 1e-6  # The best point counts as solved below this error. A growth by 1/_ENOUGH ends the iteration.
+_GAP = 1e-8  # The iteration ends if the relative gap and the violation are below this.
+_ENOUGH = 1e-6  # The best point counts as solved below this error. If the error grows by 1/_ENOUGH, the iteration ends.
 _KEPT = 0.98  # length of a step, relative to the distance to the boundary
-_SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by one towards S Z = _CENTRING mu I.
+_SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by a step towards S Z = _CENTRING mu I.
 
 
-_Parts = list[Any]  # a stack of Hermitian matrices for each block
+_Parts = list[Any]  # for each block a stack of Hermitian matrices (k, n, n)
 
 
 def _stacked(problem: ConeProgram) -> ConeProgram:
-    """Return the problem with few stacks: one for all 1 x 1 blocks, and one for each size and set of unknowns."""
+    """Return the problem with one block for all 1 x 1 matrices, and one for each further size and set of unknowns."""
     stacks: dict[tuple[int, tuple[int, ...]], list[Inequality]] = {}
     for block in problem.blocks:
         unknowns, by = tuple(block.unknowns), block.slopes
@@ -271,7 +274,10 @@ def _moved(parts: _Parts, step: float, change: _Parts) -> _Parts:
 
 
 class _Newton:
-    """The linearised equations at (S, Z) with these residuals. Raises LinAlgError if singular to rounding."""
+    """The linearised equations at (S, Z). Raises LinAlgError if they are singular to rounding.
+
+    `primal` and `dual` are the residuals constant + slopes x - S and cost - <slopes, Z>.
+    """
 
     def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, primal: _Parts, dual: Array) -> None:
         self._problem, self._Z, self._primal, self._dual = problem, Z, primal, dual
@@ -290,7 +296,7 @@ class _Newton:
             raise np.linalg.LinAlgError("the equations of a step are singular to rounding")
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
-        """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I; `left` is the term dZ dS."""
+        """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I. `left` is the term dZ dS."""
         right = _inner(self._problem, self._change(self._primal, mu, left)) - self._dual
         dx = self._scale * self._lapack.dpotrs(self._factor, self._scale * right)[0]
         blocks = zip(self._problem.blocks, self._primal, strict=True)
@@ -299,7 +305,7 @@ class _Newton:
         return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
 
     def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
-        """Return dZ for dS from the linearised equation S Z = mu I, with the second-order term `left`."""
+        """Return dZ for dS from the linearised equation S Z = mu I with the second-order term `left`."""
         parts = zip(self._Z, dS, left, self._inverse, strict=True)
         return [hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 
@@ -313,7 +319,10 @@ def _inner(problem: ConeProgram, Z: _Parts) -> Array:
 
 
 def _longest(roots: _Parts, steps: _Parts) -> float:
-    """Return _KEPT times the step to the boundary, at most 1; `roots` are inverse Cholesky factors of the matrices."""
+    """Return the length of a step, at most 1: _KEPT times the distance to the boundary.
+
+    `roots` are the inverse Cholesky factors of the matrices at the start of the step.
+    """
     pairs = zip(roots, steps, strict=True)
     least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
     return min(1.0, _KEPT / max(-least, 1e-300))

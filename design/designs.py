@@ -1,4 +1,4 @@
-"""The kinds of designs by name with their options, and `design_by_kind`, which makes a design of any kind."""
+"""The kinds of couplings with their conditions and options, and `design_by_kind`, which designs a coupling."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _Progress = Callable[[str, int, int], None]  # called with (task, steps done, nu
 
 class _Kind(NamedTuple):
     conditions: tuple[Condition, ...]  # allowed conditions; `usual_condition` chooses the default
-    module: str  # module of design/ that is imported on first use
-    function: str  # name of the function from a loop to a Design
-    takes: tuple[str, ...] = ()  # further arguments: condition, progress
+    module: str  # name of the module in design/; it is imported when the first coupling of this kind is designed
+    function: str  # name of the module's function, which takes a loop and returns a Design
+    takes: tuple[str, ...] = ()  # further arguments of the function: "condition", "progress"
     options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
-    limited: bool = False  # whether designs try by default to cover limited forces
-    for_less_damping: bool = False  # whether a user's own condition may request further designs, for less damping
+    limited: bool = False  # whether a design tries to cover limited forces if the user does not request it
+    for_less_damping: bool = False  # whether a coupling may be designed for a user's own condition
 
 
 KINDS = {
@@ -76,25 +76,25 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 
     The default of a spring-damper or a user's own function is this-environment, which gives the least transparency
     error. In loops with walls, worlds, ranges or varying delays, but without a latency, the default is any-environment.
-    Each of the other kinds has one condition besides known-device and known-device-any. If the bounds of the devices
-    that these two need are known, they take precedence where KINDS allows them, because they never require more
-    damping: known-device replaces this-environment in loops without a latency, and known-device-any is chosen if walls
-    exist and it covers the loop.
+    Each of the other kinds has one condition besides known-device and known-device-any.
+
+    These two conditions need bounds of the devices, and never require more damping than the conditions without bounds.
+    With known bounds they take precedence where KINDS allows them: known-device replaces this-environment in loops
+    without a latency, and known-device-any is chosen for loops with walls that it covers.
     """
-    conditions = kind_of(kind).conditions
-    less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
+    conditions, walls, world = kind_of(kind).conditions, loop.environment.walls, loop.environment.world
+    varied = walls or world or loop.ranges or loop.varying_delay
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
-    more = len(plain) == 1 and not (loop.environment.walls or loop.environment.world)
-    if loop.known_devices and KNOWN_DEVICE in conditions and not loop.latency and (more or not less):
-        return KNOWN_DEVICE.name  # It never requires more damping than this-environment.
-    walls = loop.environment.walls and not loop.environment.world
-    if walls and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
+    only = len(plain) == 1 and not (walls or world)
+    if loop.known_devices and KNOWN_DEVICE in conditions and not loop.latency and (only or not varied):
+        return KNOWN_DEVICE.name
+    if walls and not world and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
         return KNOWN_DEVICE_ANY.name
-    return (plain[-1] if less and not loop.latency else plain[0]).name  # The last condition covers more environments.
+    return (plain[-1] if varied and not loop.latency else plain[0]).name  # The last one covers the most environments.
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
-    """Return (the condition's name or None, the condition itself if it is the user's own, else None)."""
+    """Return the condition's name, and the condition itself if it is the user's own. Each is None otherwise."""
     if condition is None or isinstance(condition, str):
         return condition, None
     ours = (*_OWN.conditions, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -112,15 +112,16 @@ def design_by_kind(
 
     Args:
         kind: A name of KINDS, or FILE.py:NAME of a user's own function.
-        condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed by the
-            kind's usual condition, with a share of the damping for which the user's condition holds.
+        condition: The condition, or None for `usual_condition`. For a user's own condition the coupling is designed by
+            the kind's usual condition, for a share of the damping with which the coupling satisfies the user's
+            condition.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
-            forces if LIMITER has designs for the loop and one is found; `limiter` True requires it. `switching`
-            replaces loop.varying_delay.
+            forces if LIMITER has designs for the loop and a search finds one; with `limiter` True the design fails
+            otherwise. `switching` replaces loop.varying_delay.
 
     Raises:
-        ValueError: The kind or condition does not exist, or does not suit the loop.
+        ValueError: The kind or condition does not exist, or it is not suitable for the loop.
         Infeasible, DesignFailed: No coupling was found (design.result).
     """
     name, own = name_and_own(condition)
@@ -147,7 +148,7 @@ def design_by_kind(
 def _designed(
     loop: Loop, kind: str, condition: Condition, own: Condition | None, progress: _Progress, options: dict[str, Any]
 ) -> Design:
-    """Return the design by `condition` for the user's condition `own` or, if that is None, for `condition`.
+    """Return the coupling that is designed by `condition`. It also satisfies `own`, the user's condition, unless None.
 
     Raises the errors of `design_by_kind`.
     """
@@ -185,7 +186,7 @@ def _designed(
 
 
 def _of_own(design: Design, own: Condition) -> Design:
-    """Return the design for the user's own condition, without proofs and multipliers of another condition."""
+    """Return the design with the user's own condition, without proofs and multipliers of its first condition."""
     without = dict.fromkeys(("phi", "c", "certificate", "limiter", "switching", "searched"))
     return replace(design, condition=own.name, own=own, **without)
 
@@ -214,7 +215,7 @@ def _without_force(loop: Loop) -> bool:
 
 
 class _Turned(Environment):
-    """An environment in other coordinates of the contacts: E becomes Q'E Q with an orthogonal Q (m, m)."""
+    """An environment in turned coordinates of the contacts: Q'E Q in place of E, with an orthogonal Q (m, m)."""
 
     def __init__(self, of: Environment, Q: Array) -> None:
         self.contacts, self.of, self.Q, self.world = of.contacts, of, Q, of.world
@@ -224,7 +225,7 @@ class _Turned(Environment):
         return Q.T @ self.of.E(T) @ Q
 
     def active(self, T: float) -> str | None:
-        return self.of.active(T)  # An orthogonal Q does not change the power.
+        return self.of.active(T)  # The power does not depend on the coordinates.
 
 
 _ROUNDED = 1e-9  # share of the damping that covers the rounding of the eigenvalues of damping matrices
@@ -233,11 +234,12 @@ _ROUNDED = 1e-9  # share of the damping that covers the rounding of the eigenval
 def _in_principal_axes(
     loop: Loop, kind: str, condition: Condition, progress: _Progress, options: dict[str, Any]
 ) -> Design:
-    """Design in the principal axes of the damping matrices, turn the coupling back, and judge it by the full matrices.
+    """Return a coupling for damping matrices that are not diagonal.
 
-    With Delta_i = Q_i diag(d) Q_i' of every device, Q' Delta Q is diagonal. Conditions and mismatch do not change if E
-    and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError if the loop or the kind does not allow full
-    matrices, and DesignFailed if the coupling is not certified.
+    Each device's damping matrix is Delta_i = Q_i diag(d) Q_i'. In the coordinates turned by Q = blockdiag(Q_i), the
+    damping is diagonal, E is Q'E Q, and the conditions and the mismatch are the same (docs/theory.md). The coupling is
+    designed in these coordinates, turned back, and judged with the full matrices. Raises ValueError if no such design
+    exists for the loop or the kind, and DesignFailed if the coupling is not certified.
     """
     if loop.ranges and kind == "optimal":
         why = "an optimal coupling is designed in the principal axes of the damping, into which ranges are not turned"
@@ -252,7 +254,7 @@ def _in_principal_axes(
     values = (1 - _ROUNDED) * np.diag(Q.T @ Delta @ Q)
 
     def straight_design(part: Loop) -> Design:
-        """Return the design for `part`, the loop with a share of its damping and with all walls touching."""
+        """Return the design for `part`, which is the loop with a share of its damping and with all walls in contact."""
         delta = tuple((part.delta[0] / loop.delta[0] * values).tolist())
         straight = {"environment": _Turned(loop.environment, Q), "delta": delta, "levels": None, "ranges": None}
         design = design_by_kind(msgspec.structs.replace(part, **straight), kind, condition, progress, **options)
@@ -270,7 +272,7 @@ def _in_principal_axes(
 
 
 def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
-    """Return an error suffix that names a design that succeeds for this loop, or ""."""
+    """Return the end of an error message, which proposes this kind of design, or "" if the design fails."""
     with suppress(ValueError, DesignFailed):
         design = design_by_kind(loop, kind, **options)
         if design.requirement.certified:
@@ -279,16 +281,18 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
 
 
 def _before_walls(loop: Loop) -> str:
-    """Return an error suffix that names the first design that is certified with walls, or the designs tried."""
-    others = {
-        f"--coupling {kind} --condition {ANY_ENVIRONMENT.name}": kind for kind in ("spring-damper", "moving-average")
-    }
-    for words, kind in others.items():
-        if suffix := _instead(loop, words, kind, condition=ANY_ENVIRONMENT.name):
-            return suffix
-    words = "--coupling spring-damper --condition this-environment"
-    tried = f"; tried and not certified either: {', '.join((*others, words))}"
-    return _instead(loop, words, "spring-damper", condition=THIS_ENVIRONMENT.name) or tried
+    """Return the end of an error message: the first certified design for this loop with walls, or all that failed."""
+    tried = []
+    others = (
+        ("spring-damper", ANY_ENVIRONMENT),
+        ("moving-average", ANY_ENVIRONMENT),
+        ("spring-damper", THIS_ENVIRONMENT),
+    )
+    for kind, condition in others:
+        tried.append(f"--coupling {kind} --condition {condition.name}")
+        if proposal := _instead(loop, tried[-1], kind, condition=condition.name):
+            return proposal
+    return f"; tried and not certified either: {', '.join(tried)}"
 
 
 def own_coupling(name: str, loop: Loop) -> Any:
@@ -296,17 +300,19 @@ def own_coupling(name: str, loop: Loop) -> Any:
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
-_UNUSED = 0.005  # `_with_less_damping` ends if the coupling leaves less than this share of the damping unused.
+_UNUSED = (
+    0.005  # `_with_less_damping` ends when a certified coupling leaves less than this share of the damping unused.
+)
 
 
 def _with_less_damping(
     loop: Loop, make: Callable[[Loop], Design], condition: Condition, made_for: Condition | None = None
 ) -> Design:
-    """Return a design for a share of the damping whose coupling satisfies the condition in this loop.
+    """Return a design for a share of the damping, with a coupling that satisfies `condition` for all of the damping.
 
-    Up to LESS_DAMPING_ROUNDS shares are tried, until the coupling needs almost all of the damping. The designs are made
-    for the condition `made_for` (by default `condition`) in the nominal environment, with all walls touching and
-    without the latency. Designs that cannot consider switching delays use the longest delays.
+    `make` designs each coupling for the condition `made_for` (by default `condition`), in the nominal environment, with
+    all walls in contact and without the latency. If `make` cannot consider switching delays, the loop has its longest
+    delays. Up to LESS_DAMPING_ROUNDS shares are tried, until the coupling needs almost all of the damping.
     """
     share, best, shortfall = 1.0, None, ""
     walls = loop.environment.walls
@@ -321,7 +327,7 @@ def _with_less_damping(
         needs = condition.judge(judged, design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            # The notes are dropped, because they describe the loop with a share of the damping.
+            # The notes are dropped, because their figures are those for a share of the damping.
             best = replace(design, requirement=needs, notes=())
             if needs.ratio > 1 - _UNUSED:
                 return best

@@ -1,8 +1,8 @@
 """Design state-space couplings of a given order that satisfy Theorem 4 (`--coupling ccl`, Remark 5 of the paper).
 
-A descent from a spring-damper design minimises ||L W2||_inf (23). Each step solves a convex problem whose solutions
-all satisfy the condition. A refined sweep then checks Theorem 4. The cone complementarity algorithm of Remark 5 is not
-offered, because its bisection on mu stalls near its start.
+A descent reduces ||L W2||_inf (23). It starts at a spring-damper design. Each step solves a convex problem whose
+solutions all satisfy Theorem 4, and a refined sweep then checks Theorem 4 for the new coupling. The cone
+complementarity algorithm of Remark 5 is not used, because its bisection on mu stalls near its start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from haptic_loop.design.environments import ANY_ENVIRONMENT, least_phi
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
 _MOST_STATES = 10  # largest order per channel; each state adds a row and a column to every cone
-_SPARE_POLE = 0.5  # The initial poles of the states after the first are powers of this number.
+_SPARE_POLE = 0.5  # At the start the second and later states of a channel have powers of this number as poles.
 
 
 class _Units:
@@ -34,7 +34,8 @@ class _Units:
     def __init__(self, shaping: lmi.Shaping, phi: Array | None) -> None:
         loop, self.usable, self.T = shaping.loop, shaping.usable, shaping.loop.T
         names, none = loop.environment.contacts, (0,) * loop.channels
-        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # The condition ignores it.
+        # Theorem 4 does not depend on the environment, so this one is arbitrary.
+        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))
         self.loop = Loop(1.0, loop.theta, none, none, (1.0,) * loop.channels, anything)
         self.phi = None if phi is None else phi / self.usable
 
@@ -44,7 +45,7 @@ class _Units:
         return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
 
     def block(self, V: Lti) -> Lti:
-        """Return the block of Theorem 4, affine in V; its rows for phi are scaled to a unit diagonal."""
+        """Return the block of Theorem 4, which is affine in V. Its rows for phi are scaled to a unit diagonal."""
         demand = any_environment_demand(V, self.loop, self.phi)
         block, one = demand.gain + demand.free, np.ones(V.inputs)
         scale = np.diag(np.append(one, 1 / np.sqrt(np.diag(block.D)[V.inputs :])))
@@ -52,16 +53,16 @@ class _Units:
 
 
 # ----------------------------------------------------------------------------------------------------
-# State-space couplings of fixed order, in a realisation where Theorem 4 and the loop (22) are affine.
+# State-space couplings of fixed order, in a realisation whose unknowns enter Theorem 4 and L (22) affinely.
 #
 # V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`) has the static compliance V1, and Theorem 4 uses the quotient
 # (V - V1)/(z - 1) = -F (zI - A)^-1 B. Here F is a matrix, not the map (6). If F is fixed, the state matrices of V, of
-# this quotient and of the loop (22) are affine in (A, B, V1). To fix an F of full row rank loses no generality: a
-# change of state leads to any such F.
+# this quotient and of L are affine in (A, B, V1). Any F of full row rank gives the same set of V, because a change of
+# state maps one such F to another.
 
 
 class _FixedOrder:
-    """The couplings with `order` states per channel; the unknowns p are the free entries of A, B and V1.
+    """The couplings with `order` states per channel. The vector p of unknowns holds the free entries of A, B and V1.
 
     V has no entries between different channels. phi (m,) [N s/m] is the multiplier for psi >= 1, or None for psi = 0.
     """
@@ -91,10 +92,10 @@ class _FixedOrder:
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
-        """Return p of a spring-damper. Each further state is driven by the state before it, and no output reads it.
+        """Return p of a spring-damper. Each further state has the state before it as input, and affects no output.
 
-        All states are then reachable if there are dampers. A state that is read but not driven would make the storage
-        of the weighted loop singular.
+        All states are then reachable if there are dampers. A state without input would make the storage of L W2
+        singular.
         """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)
@@ -107,7 +108,7 @@ class _FixedOrder:
         return np.concatenate([M[free] for M, free in zip(parts, self._free, strict=True)])
 
     def block(self, p: Array) -> Lti:
-        """Return the block of the condition, affine in p."""
+        """Return the block of Theorem 4, affine in p."""
         return self.units.block(self.unit_coupling(p))
 
     def weighted_loop(self, p: Array) -> Lti:
@@ -117,7 +118,7 @@ class _FixedOrder:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Storage matrices of a given coupling, with which the inequalities of a fixed-order design hold at the start.
+# Storage matrices of the first coupling, with which it satisfies the inequalities of the first step.
 
 
 def _passivity_storage(family: _FixedOrder, p: Array) -> Array:
@@ -139,8 +140,11 @@ def _gain_storage(family: _FixedOrder, p: Array, mu: float) -> Array:
 
 
 def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
-    """Return the P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
-    every = range(lmi.packed(n) + 1)  # P and s
+    """Return the symmetric P (n, n) with the largest s <= 1 such that inequality(P) >= s I and P >= s I.
+
+    `what` names the problem in error messages.
+    """
+    every = range(lmi.packed(n) + 1)  # indices of the unknowns: the entries of P, then s
 
     def roomy(of: Callable[[Array], Array]) -> Inequality:
         def room(x: Array) -> Array:
@@ -158,7 +162,7 @@ _System = tuple[Array, Array, Array, Array]  # A, B, C, D
 
 
 def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Array], _System]:
-    """Return the function p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
+    """Return the function that maps p - at to A, B, C, D of a system that is affine in p, with the states L^-1 x."""
     n = L.shape[0]
 
     def stacked(p: Array) -> Array:
@@ -178,22 +182,22 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # ----------------------------------------------------------------------------------------------------
 # Fixed-order couplings by inner convex approximation: descent on ||L W2||_inf in which every step is feasible.
 #
-# Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
-# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
-# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. So each semidefinite
-# program (SDP) improves the coupling. It needs no bisection, because mu^2 enters linearly. In state coordinates with
-# Q0 = I the tangent is 2I - Q.
+# Lemmas 2 and 3 are affine in the coupling except for the inverses Y = Q^-1 and X = U^-1 (20), (24b). The inverse of a
+# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. If this tangent replaces Y, and the
+# tangent at U0 replaces X, the feasible set becomes a convex subset that still contains the present coupling. So each
+# semidefinite program (SDP) reduces the norm. It needs no bisection, because mu^2 enters linearly. In state coordinates
+# with Q0 = I the tangent is 2I - Q.
 
 
-_SETTLED = 1e-4  # The descent ends after a step that improves the norm by less than this share.
-_FIRST_ROOM = 0.05  # The first storage U proves a norm that is larger than the initial norm by this share.
-_LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step from I; they keep 2I - Q, 2I - U positive
+_SETTLED = 1e-4  # The descent ends after a step that reduces the norm by less than this share.
+_FIRST_ROOM = 0.05  # The first storage U proves a bound that exceeds the norm of the first coupling by this share.
+_LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step; 2I - Q and 2I - U stay positive
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
-    """Yield successive couplings from the strictly feasible p with the norm `norm`.
+    """Yield the unknowns of successive couplings, from the strictly feasible p of a coupling with the norm `norm`.
 
-    The descent ends when Q or U is singular, or when the solver's accuracy is exhausted.
+    The descent ends when Q or U is singular, or when the solver fails because a step is as small as its rounding.
     """
     try:
         Q = np.linalg.inv(_passivity_storage(family, p))
@@ -206,9 +210,9 @@ def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
 
 
 def _step(family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> tuple[Array, Array, Array]:
-    """Return p, Q and U of least mu near the coupling `at`, by one SDP with Lemmas 2 and 3.
+    """Return p, Q and U with the least mu, by one SDP with Lemmas 2 and 3 near the coupling with the unknowns `at`.
 
-    The unknowns are p - at, Q, U and mu^2/norm^2, in coordinates in which Q = U = I at the coupling `at`.
+    The SDP's unknowns are p - at, Q, U and mu^2/norm^2, in coordinates with Q = U = I at this coupling.
     """
     LQ, LU = np.linalg.cholesky(Q), np.linalg.cholesky(U)
     block = _affine(family.block, at, LQ)
@@ -243,14 +247,14 @@ def _step(family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> tu
     return at + p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 
-_START_ROOM = 1e-3  # The start is designed for damping reduced by this share, so that it is strictly feasible.
+_START_ROOM = 1e-3  # unused share of the damping of the first coupling, so that it is strictly feasible
 
 
 def design(loop: Loop, order: int = 1, most_sdps: int = budgets.FIXED_ORDER_PROBLEMS) -> Design:
-    """Design a coupling with `order` states per channel by a descent from strictly feasible spring-damper gains.
+    """Return a coupling with `order` states per channel, by a descent of at most `most_sdps` steps.
 
-    The descent has at most `most_sdps` steps. Raises Infeasible if Theorem 4 admits no spring-damper to start from,
-    DesignFailed if no result is certified.
+    The descent starts at a spring-damper. Raises Infeasible if Theorem 4 admits none, and DesignFailed if no coupling
+    is certified.
     """
     whole("order", order, 1, _MOST_STATES)
     shaping, phi = lmi.Shaping(loop), least_phi(loop)

@@ -1,12 +1,12 @@
 """Search spring-damper gains for one environment, from several starts (called by design.spring_damper).
 
-The feasible set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by
-sequential quadratic programming with the condition at sampled frequencies. The frequency at which a refined sweep finds
-the worst violation is added, until the gains pass the sweep or a budget is spent.
+The set of certified gains is not convex in (K, B), so the result may be a local optimum. Sequential quadratic
+programming (SLSQP) minimises the rms mismatch with the condition at sampled frequencies. The frequency at which a
+refined sweep finds the worst violation is added, until the gains pass the sweep or a budget is spent.
 
 The block of a condition is affine in G = (I + Psi E V)^-1 Psi E and, for fixed G, in the multiplier. So its
 responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes. Only the block of
-known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew at each x.
+known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew for each gains and multiplier.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, in_band, rms_mismatch
 
-#: share of the damping in reserve at sampled frequencies, because the condition may be violated between them
+#: unused share of the damping at sampled frequencies, because the gains may need more damping between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m] bounds of K in the search
-_CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
-_STUCK = 1e-3  # A search that ends with a larger violation than this is given up.
-FEW = 12  # largest number of channels for which steps are cheap
-_ROUGH = 0.01  # If gains violate the condition by more than this, the search tries them last.
+_CLOSEST_POLE = 1e-5  # least distance of the loop's poles from the unit circle
+_STUCK = 1e-3  # A search whose result violates the condition by more than this is given up.
+FEW = 12  # Up to this number of channels a step of the search is cheap, so that all starts are tried.
+_ROUGH = 0.01  # A start whose gains violate the condition by more than this is tried last.
 _DIFFERENCE = 1e-7  # step of finite differences in x
 
 
@@ -62,10 +62,10 @@ class _Responses:
         self._last: tuple[Array, Complex, Array | Complex] | None = None
 
     def around(self, gains: Array) -> tuple[Complex, Array | Complex]:
-        """Return G = (I + Psi E V)^-1 Psi E, (k, m, m), and by (2, k, m).
+        """Return G = (I + Psi E V)^-1 Psi E, (k, m, m), and `by` (2, k, m), the factors in the derivatives of G.
 
-        The derivatives of G are dG/d(log K_i) = by[0, k, i] G[k, :, i] G[k, i, :], and the same with by[1] for
-        B_i/delta_i.
+        At frequency k, dG/d(log K_i) is by[0, k, i] times column i of G times row i of G. For B_i/delta_i the factor is
+        by[1, k, i].
         """
         if self._last is None or not np.array_equal(self._last[0], gains):
             log_k, b = np.split(gains, 2)
@@ -78,7 +78,7 @@ class _Responses:
 
 
 def _theta(loop: Loop, z: Complex) -> Complex:
-    """Return the diagonal of the delays Theta at z (k,), as (k, m, 1)."""
+    """Return the diagonal of Theta, the forces' delays, at z (k,), as (k, m, 1)."""
     one = Sampled(z[None], np.tile(np.eye(loop.channels, dtype=complex), (1, z.size, 1, 1)), loop.T)
     return np.diagonal(loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]
 
@@ -86,10 +86,11 @@ def _theta(loop: Loop, z: Complex) -> Complex:
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
 
-    delta is that of `even_damping`. The unknowns of the condition's multiplier follow the 2m gains.
+    delta (m,) is that of `even_damping`. In x the unknowns of the condition's multiplier follow the 2m gains. The
+    condition of this class is this-environment, which has no multiplier.
     """
 
-    #: indices of the channels with a multiplier, each with one more row of the block; KnownDeviceLoop: of all devices
+    #: indices of the channels (in KnownDeviceLoop: of the devices) with a multiplier. Each adds a row to the block.
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
@@ -119,15 +120,15 @@ class SampledLoop:
         return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
 
     def judged(self, x: Array) -> Requirement:
-        """Return the requirement of the gains at x, by the refined sweep of the condition."""
+        """Return the required damping of the gains at x, from a refined sweep of the condition."""
         return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
     def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
-        """Return the condition's demand for G and the multiplier mu (active,)."""
+        """Return the condition's block for G and the multiplier mu (active,), as a Demand."""
         return this_environment_demand(self.loop.late(G), self.loop)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """Return the multiplier (active,) at x, and its derivative (active, active) by the unknowns after the gains."""
+        """Return the multiplier mu (active,) at x, and its derivative (active, active) by its unknowns in x."""
         return np.zeros(0), np.zeros((0, 0))
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
@@ -177,15 +178,15 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the margin of the sampled condition at each frequency (k,).
+        """Return the margin of the condition at each sampled frequency, (k,).
 
-        With delay in the environment `stability` is appended, because the sampled condition does not imply it.
+        If psi >= 1, `stability` is appended, because an unstable loop may satisfy the condition at all frequencies.
         """
         room = self._margins(x)
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """Return the gradient of `room`, with finite differences for the poles."""
+        """Return the gradient of `room`, (k or k + 1, entries of x), with finite differences for `stability`."""
         slope = self._margin_slopes(x)
         if not any(self.loop.psi):
             return slope
@@ -217,13 +218,13 @@ class SampledLoop:
         return np.concatenate(slope, axis=1)
 
     def _spread(self, mu: Array) -> Array:
-        """Return mu for each stored entry of the block, (m + 3 active,)."""
+        """Return the factor mu of each stored entry of the block, (m + 3 active,)."""
         first = np.zeros(self.loop.channels)
         first[self.active] = mu
         return np.concatenate([first, mu, mu, mu])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """Return He of the block: upper left (k, m, m), lower left (k, active, m), lower right's diagonal."""
+        """Return parts of He[block]: upper left (k, m, m), lower left (k, active, m), diagonal of lower right."""
         G, mu = self._imposed.around(self._gains(x))[0], self._spread(self.mu(x)[0])
         m, p = self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
@@ -236,8 +237,9 @@ class SampledLoop:
     def _least(self, x: Array) -> tuple[Array, Complex]:
         """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
 
-        The eigenvalue is in units of delta/T. The Schur complement is that of the lower right part, which is diagonal
-        and positive. v is the eigenvector, extended by those entries of the lower rows that minimise v* block v.
+        The lower right part of the block is diagonal and positive, and the Schur complement eliminates its rows. The
+        eigenvalue is in units of delta/T. The first m entries of v are the eigenvector, and the others minimise
+        v* block v.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -250,12 +252,12 @@ class SampledLoop:
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
-        """Return the distance of the loop's poles from the unit circle, less _CLOSEST_POLE."""
+        """Return the least distance of the loop's poles from the unit circle, less _CLOSEST_POLE."""
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
     def search(self, x: Array, most: int) -> Array:
-        """Return x after at most `most` steps towards a local optimum."""
+        """Return x after at most `most` steps of SLSQP towards a local optimum."""
         m = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
         return _slsqp(self.square_mismatch, self.square_mismatch_slope, self.room, self.room_slope, x, bounds, most)
@@ -270,9 +272,9 @@ def _slsqp(
 ) -> Array:
     """Minimise f subject to room(x) (m,) >= 0 by at most `most` steps of SLSQP; return x (n,).
 
-    With SciPy 1.17 the compiled routine is called in a loop like that of `minimize`, because the import of
-    scipy.optimize takes 0.2 s. The routine's state and workspace differ between releases, so with any other release
-    `minimize` itself is called.
+    With SciPy 1.17 the compiled routine is called in a loop like that of `scipy.optimize.minimize`, because the import
+    of scipy.optimize takes 0.2 s. The routine's state and workspace differ between releases, so that `minimize` itself
+    is called with any other release.
     """
     import scipy  # slow to load
 
@@ -292,7 +294,8 @@ def _slsqp(
     state |= dict.fromkeys(("exact", "inconsistent", "reset", "iter", "line", "meq", "mode"), 0)
     state |= {"acc": _SETTLED, "tol": 10 * _SETTLED, "itermax": most, "m": m, "n": n}
     multipliers, indices = np.zeros(m + 2 * n + 2), np.zeros(m + 2 * n + 2, dtype=np.int32)
-    buffer = np.zeros(2 * (n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28))  # twice that of `minimize`
+    # The workspace is twice as large as that of `minimize`.
+    buffer = np.zeros(2 * (n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28))
     while True:
         step(state, value, gradient, normals, rooms, x, multipliers, low, high, buffer, indices)
         if state["mode"] == 1:
@@ -304,7 +307,7 @@ def _slsqp(
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """Return the first channel of each device, and a matrix (m, m) of means over the axes of each device."""
+    """Return each device's first channel, and the matrix (m, m) that replaces values by their mean over a device."""
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
 
@@ -312,22 +315,20 @@ def _shared(loop: Loop) -> tuple[list[int], Array]:
 class SwitchingLoop(SampledLoop):
     """The loop under any switching of delays: x = (log K, B/delta, log(alpha T/delta) of `active`).
 
-    `judged` ignores the alpha in x and searches for the best alpha with `SWITCHING`.
+    alpha [N/m] is the multiplier of `SWITCHING`. `judged` ignores the alpha in x and searches the best one.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
-    _first = 0.5  # first value of alpha T/delta, if the search of SWITCHING finds no alpha
+    _first = 0.5  # value of alpha T/delta at the start, if the search of SWITCHING finds no alpha
 
     def __init__(self, loop: Loop) -> None:
-        if loop.environment.walls or loop.latency:
-            raise ValueError("gains for switching delays need an environment without walls, and a loop without latency")
         self.active = np.flatnonzero(np.subtract(loop.delays.hi, loop.delays.lo))
         self.lead, self.shared = _shared(loop)
         self.unit = np.array(loop.per_channel(loop.per_device(even_damping(loop)).tolist())) / loop.T
         super().__init__(loop)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """Return x of the gains and their best multiplier alpha."""
+        """Return x of the gains and of their best multiplier alpha."""
         multiplier = SWITCHING.required(self.loop, coupling).multiplier
         alpha = np.array(self.loop.per_channel(multiplier)) if multiplier else self._first * self.unit
         a = (alpha / self.unit)[self.active]
@@ -349,10 +350,10 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """The loop with limited forces: x = (log K, B/delta, c), where c has one weight of the limiter per channel."""
+    """The loop with limited forces: x = (log K, B/delta, c), where c (m,) is the multiplier of `LIMITER`."""
 
     bounds = (0.0, 5.0)
-    _first = 0.5  # first value of c
+    _first = 0.5  # value of c at the start
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)
@@ -379,13 +380,13 @@ class LimiterLoop(SampledLoop):
 class KnownDeviceLoop(SampledLoop):
     """The loop on known devices: x = (log K, B/delta, log(beta/largest beta) of each device).
 
-    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch), where
-    `device_rows` returns l11, l21 (twice the entry 21) and l22. The left side is the block of known-device after its
-    rows of speeds are eliminated.
+    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch). `device_rows`
+    returns the entries l11 and l22 of the cost's matrix, and l21, which is twice its entry 21. The left side is the
+    Schur complement of the block of known-device, without the rows of speeds.
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # first value of beta/(largest beta); the least mismatch hardly depends on beta
+    _first = 0.35  # value of beta/(largest beta) at the start; the least mismatch hardly depends on it
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE
@@ -445,7 +446,7 @@ _SAME = 1e-3  # Two results of a search are one local optimum if no entry of x d
 
 
 def _optimum(sampled: SampledLoop, start: SpringDamper, known: Sequence[Array]) -> tuple[Array | None, int]:
-    """Return (x of a new local optimum that passes the refined sweep, or None; number of searches)."""
+    """Return (x, number of searches), where x is a new local optimum that passes the refined sweep, or None."""
     x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
         x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)])
@@ -455,26 +456,26 @@ def _optimum(sampled: SampledLoop, start: SpringDamper, known: Sequence[Array]) 
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
         stuck = sampled.room(x).min() < -_STUCK
-        if stuck or requirement.frequency_hz is None:  # An unstable loop has no frequency to add.
+        if stuck or requirement.frequency_hz is None:  # The sweep of an unstable loop returns no frequency.
             return None, searches
         sampled.add(max(2 * np.pi * sampled.loop.T * requirement.frequency_hz, 1e-6))
     return None, budgets.GAIN_ROUNDS
 
 
 class Optimum(NamedTuple):
-    """Best local optimum of a search; without one `gains` is None."""
+    """Best local optimum of several searches, or None for `gains` if the searches found none."""
 
     gains: SpringDamper | None = None
-    rms: float = np.inf  # mismatch, as a ratio
-    searches: int = 0  # number of searches until now
-    multiplier: Sequence[Sequence[float]] | None = None
+    rms: float = np.inf  # rms mismatch, relative to the environment
+    searches: int = 0  # number of searches
+    multiplier: Sequence[Sequence[float]] | None = None  # c of the limiter, one row per device
 
 
 def least_rms(sampled: SampledLoop, starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ) -> Optimum:
     """Return the best local optimum that is reached from the starts.
 
-    All searches share the frequencies that they add to `sampled`. For more than FEW channels the first optimum is
-    returned, because steps are expensive and the start hardly matters.
+    Every search adds frequencies to `sampled`, which later searches use, too. For more than FEW channels the first
+    optimum is returned, because steps are expensive and the start hardly matters.
     """
     best, loop, known = Optimum(), sampled.loop, list[Array]()
     for start in starts:
@@ -493,7 +494,7 @@ def least_rms(sampled: SampledLoop, starts: Iterable[SpringDamper], band_hz: tup
 
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
-    """Return the gains after a few steps from each start, sorted by mismatch, with infeasible gains last."""
+    """Return the gains after GAIN_STEPS[0] steps from each start, sorted by mismatch, with infeasible gains last."""
     points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]) for start in starts]
     points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
     return [sampled.coupling(x) for x in points]

@@ -1,8 +1,8 @@
 """Design the optimal coupling: the force filter R of least mismatch whose loop satisfies a condition, with a proof.
 
-The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
-solution so that a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
-proves, if there is one. Since R(1) = g I, the static stiffness is F(1) = g E(1).
+The search tries larger and larger bases of R. For each basis it solves a convex program (design.program), rounds the
+coefficients of R to decimals, and scales the forces down until a refined sweep certifies the coupling. It returns the
+best coupling that exact arithmetic proves, if there is one. Since R(1) = g I, the static stiffness is F(1) = g E(1).
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import search_ranges
 
-_SETTLED_DB = 0.05  # [dB] A basis that gains less ends the search; under this-environment only from _FEWEST_TAPS on.
+#: The search ends after a basis of at least _FEWEST_TAPS taps that gains less than this [dB]. The number depends on
+#: whether this-environment is the only constraint (`_Search.simply`).
+_SETTLED_DB, _FEWEST_TAPS = 0.05, {True: 22, False: 14}
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 #: The search ends before a basis of more than 26 taps if the last basis was certified and gained less than 0.1 dB.
 _LARGE, _PROMISING_DB = 26, 0.1
-_FEWEST_TAPS = {True: 22, False: 14}  # least number of taps of a basis whose small gain ends the search, by `simply`
-_KEPT_STIFFNESS = 0.5  # A solution is rejected below this share of the static stiffness of an accepted solution.
-_FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's stiffness is dropped.
-# Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
-_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))
-_HOPELESS = 0.9  # Above this mismatch (`_Search.mismatch`) the result is compared with simpler couplings.
-_RESERVES = (0.95, 2.5, 50.0)  # unused damping in units of MARGIN; if a proof fails, the next value is tried
-# An environment that requires more than 1 + _TOLERATED times the damping is added to the program. Scaling the forces
-# removes smaller excesses.
+_KEPT_STIFFNESS = 0.5  # A coupling is rejected if it has less than this share of the best coupling's static stiffness.
+_FELT_STIFFNESS = 0.02  # A static stiffness below this share of the environment's is not felt, so it may be lost.
+_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # tried (beta, c) of a limiter; if psi = 0, the first alone
+_HOPELESS = 0.9  # Above this mismatch (`_Search.mismatch`) the coupling is compared with simpler ones.
+_RESERVES = (0.95, 2.5, 50.0)  # unused damping in units of MARGIN; after a failed proof the next value is tried
+#: An environment in which the coupling requires more than 1 + _TOLERATED times the damping is added to the program. For
+#: smaller excesses the forces are scaled down.
 _TOLERATED = 0.02
 _SEARCHED = 0.2  # least share of --seconds for the search between the vertices of ranges
 
@@ -54,8 +54,8 @@ class _BasisResult:
     poles: int
     states: int  # order of the loop
     mismatch_db: float  # [dB] objective
-    g: float  # rendered share of the static stiffness
-    # None, _SETTLED, or why the sweep (with a limiter or known devices: the proof) does not certify the coupling
+    g: float  # share of the environment's static stiffness
+    # Reason why the coupling is not certified, or None. With a limiter or known devices, certified means proved.
     reason: str | None
     seconds: float  # time since the design began
     rejected: str | None = None  # reason why the coupling is rejected although it is certified, or None
@@ -71,7 +71,7 @@ class _BasisResult:
 
 @dataclass(frozen=True, eq=False)
 class Optimal(Design):
-    """Best coupling, with its certificate if it is proved, and the results of all bases that were tried."""
+    """The best coupling, with its certificate if it is proved, and the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
     g: float = field(kw_only=True)  # F(1) = g E(1); for couplings other than force filters, norm(F(1))/norm(E(1))
@@ -94,7 +94,7 @@ def _silent(task: str, finished: int, bases: int) -> None:
 def design_with(
     loop: Loop, condition: str = THIS_ENVIRONMENT.name, progress: _Progress = _silent, **options: Any
 ) -> Optimal:
-    """Design the optimal coupling under `condition` for Options(**options); `progress` is called before each task."""
+    """Return the optimal coupling under `condition` for Options(**options). `progress` is called before each task."""
     made = _for_known_devices if condition == KNOWN_DEVICE.name else design
     return made(loop, program.Options(**options), progress)
 
@@ -102,11 +102,10 @@ def design_with(
 def design(loop: Loop, options: program.Options = program.DEFAULT, progress: _Progress = _silent) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
-    With ranges around the environment, a proved coupling satisfies this-environment at every vertex (at 128 if there
-    are more) and at every point that the search between the vertices visits. With a range of delays, any switching
-    within the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
-    candidates, too: the environment scaled down (R = kappa I) and the best spring-damper. The function returns the best
-    candidate.
+    With ranges around the environment, a proved coupling satisfies this-environment at every vertex (at 128 vertices
+    if there are more) and at every point that the search between the vertices visits. With a range of delays, any
+    switching within the range is safe. If no optimal coupling can be proved or its mismatch is large, it is compared
+    with two simpler couplings: the environment scaled down (R = kappa I) and the best spring-damper.
 
     Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
     that has no design in this loop, and for a loop that no damping makes safe without a coupling.
@@ -134,7 +133,7 @@ def design(loop: Loop, options: program.Options = program.DEFAULT, progress: _Pr
 
 
 def _over_bases(search: _Search) -> tuple[list[Optimal], bool]:
-    """Return the successive best couplings, and whether --seconds ended the search."""
+    """Return the couplings that were accepted, from worst to best, and whether --seconds ended the search."""
     improving, results = list[Optimal](), search.results
     floor, gained = _felt(min(search.simple, 1.0)), np.inf
     for taps, poles in search.options.bases:
@@ -173,17 +172,17 @@ def _over_bases(search: _Search) -> tuple[list[Optimal], bool]:
     return improving, False
 
 
-#: tried shares of the largest beta, the same in all channels, because different shares gain hardly anything
+#: tried shares of the largest beta. All channels have the same share, because different shares gain hardly anything.
 _ETAS = 0.15, 0.3, 0.5
 _SCALINGS = 6  # largest number of scalings of the forces; each reduces them by at least the share MARGIN
 
 
 def _for_known_devices(loop: Loop, options: program.Options, progress: _Progress) -> Optimal:
-    """Return the best coupling under known-device, or under this-environment if that is better.
+    """Return the best coupling under known-device, or the best under this-environment if its mismatch is less.
 
     For fixed beta and fixed multipliers of the facts (design.facts) the block is affine in the forces. The filter over
-    the smallest basis is designed for three values of beta. A parabola in log beta through their three merits gives the
-    beta of larger bases, which use the multipliers of the last accepted filter.
+    the smallest basis is designed for three values of beta. The parabola in log beta through their three merits has its
+    least value at the beta that is used for larger bases. These use the multipliers of the last accepted filter.
 
     Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
@@ -230,17 +229,17 @@ def _for_known_devices(loop: Loop, options: program.Options, progress: _Progress
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """A loop, the design's options and the environments with their constraints."""
+    """The search for one loop: its options, and the environments with their constraints."""
 
     loop: Loop
     options: program.Options
     cases: tuple[program.Case, ...]  # the loop's nominal environment, then the vertices of its ranges
     bare: float  # required over available damping without a coupling, in the worst environment
-    started: float  # clock time [s] of the start, for the report and for --seconds
-    spent: int  # counted work at the start
+    started: float  # clock time [s] at the start, for the report and for --seconds
+    spent: int  # work that had been counted at the start
     progress: _Progress
     condition: Condition = THIS_ENVIRONMENT  # the condition that judges and proves couplings
-    results: list[_BasisResult] = field(default_factory=list)  # of the finished bases; the search appends to it
+    results: list[_BasisResult] = field(default_factory=list)  # results of the finished bases, which the search adds
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options, progress: _Progress) -> _Search:
@@ -274,6 +273,7 @@ class _Search:
         self.progress(f"{task}{last}", len(self.results), len(self.options.bases))
 
     def result(self, taps: int, poles: int, candidate: Optimal) -> _BasisResult:
+        """Return the result of the basis with this best coupling."""
         error = self.decibels(candidate)
         return _BasisResult(taps, poles, candidate.states, error, candidate.g, candidate.reason, self.elapsed)
 
@@ -295,11 +295,11 @@ class _Search:
 
     @property
     def simply(self) -> bool:
-        """Whether this-environment is the only constraint, without ranges and without a latency."""
+        """Whether this-environment is the only constraint, and the loop has neither ranges nor a latency."""
         return not (self.constrained or self.loop.latency or self.loop.ranges)
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
-        """Return the certified limiter of the solution `before`, or those of _LAGS; (None,) without the limiter."""
+        """Return the limiters to try: that of the coupling `before`, or those of _LAGS, or (None,) for no limiter."""
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
@@ -324,23 +324,24 @@ class _Search:
         return decibels(self.mismatch(candidate))
 
     def merit(self, candidate: Optimal) -> float:
-        """Return the objective that ranks solutions: mismatch combined with lost static stiffness, as a ratio."""
+        """Return the figure that ranks couplings, less is better: mismatch combined with lost static stiffness."""
         static = program.static_weight(self.loop) * (candidate.g - 1) if np.isfinite(candidate.g) else 0.0
         return float(np.hypot(self.mismatch(candidate), static))
 
     def gained(self, before: Optimal | None, candidate: Optimal) -> float:
-        """Return the improvement of the merit over the solution `before` [dB]; infinity if `before` is None."""
+        """Return how much less the merit is than that of the coupling `before` [dB]; infinity if `before` is None."""
         return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(candidate))
 
     @property
     def simple(self) -> float:
-        """The largest kappa for which R = kappa I satisfies this-environment with MARGIN unused; 1 if `bare` is 0."""
+        """The largest kappa for which R = kappa I satisfies this-environment with MARGIN unused, or 1 if all do."""
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
-        """Return the design without a coupling, or None.
+        """Return the loop without a coupling as a design, if nothing can be better, or None.
 
-        It is None if the design has a mismatch, is not safe, has further constraints, or lacks the limiter's proof.
+        The result is None if this loop has a mismatch or is not safe, if there are further constraints, or if a limiter
+        is requested and has no proof.
         """
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
@@ -358,7 +359,7 @@ class _Search:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
-        """Return whether a basis is small enough to be tried and its loop has more than `before` states."""
+        """Return whether a basis is small enough to be tried, and gives a loop with more than `before` states."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own, full = int((span.used.sum(axis=1) > 0)[:, :m].sum()), span.used.shape[2] == m
@@ -372,10 +373,10 @@ class _Search:
     def over_basis(
         self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
     ) -> tuple[Optimal, _BasisResult]:
-        """Return the optimum over a basis, scaled so that every sweep passes, and its result.
+        """Return the best coupling over a basis, scaled so that every sweep passes, and the basis's result.
 
-        With a limiter the proof of the optimum is tried, too. If the optimum renders less than the share `floor` of the
-        static stiffness, the program is solved again with a larger weight of the stiffness.
+        If the coupling has less than the share `floor` of the environment's static stiffness, the program is solved
+        again with a larger weight of the stiffness. `before` and `least` are those of `solved`.
         """
         for heavier in (1.0, 2.5, 6.0):
             tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
@@ -393,9 +394,13 @@ class _Search:
         heavier: float,
         least: float,
     ) -> Optimal:
-        """Return the optimum over a basis, scaled so that every sweep passes; `slip` is the limiter or None.
+        """Return the best coupling over a basis, scaled so that every sweep passes.
 
-        With a limiter the proof is tried, unless the optimum gains less than `least` [dB] over the solution `before`.
+        Args:
+            before: The best coupling of smaller bases, or None.
+            slip: The limiter, or None. With a limiter the coupling is also proved, if possible.
+            heavier: The factor on the weight of the static stiffness.
+            least: The least gain over `before` [dB] for which a proof is tried.
         """
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])
@@ -403,7 +408,6 @@ class _Search:
         coupling, needs = self.kept_in_all(problem)
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
-        tried: list[Optimal] = []
         for share in _RESERVES:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
@@ -412,13 +416,13 @@ class _Search:
                 return replace(candidate, reason=_SETTLED)
             if not self.options.limiter:
                 return candidate
-            tried.append(self._proved(candidate, slip))
-            if tried[-1].proved:
+            candidate = self._proved(candidate, slip)
+            if candidate.proved:
                 break
-        return tried[-1]
+        return candidate
 
     def proved_or_smaller(self, candidate: Optimal) -> Optimal:
-        """Return the coupling with a proof, its forces scaled down if necessary, or unproved if all scalings fail."""
+        """Return the coupling with its proof, after scaling the forces down if necessary, or without a proof."""
         coupling, needs = candidate.coupling, max(candidate.requirement.ratio, 1 - program.MARGIN)
         assert isinstance(coupling, ForceFilter)
         smaller = (_scaled(coupling, (1 - share * program.MARGIN) / needs) for share in _RESERVES[1:])
@@ -427,10 +431,11 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
     ) -> tuple[ForceFilter, list[float]]:
-        """Return (coupling, required over available damping in each environment); `need` computes this ratio.
+        """Return (solution of the program, its required over available damping in each environment).
 
-        The program is first solved for the nominal environment. While an environment needs more than 1 + _TOLERATED
-        times the damping, the two worst ones are added, and the program is solved again.
+        `need` computes this ratio. The program is first solved for the nominal environment. While the coupling requires
+        more than 1 + _TOLERATED times the damping in another environment, the two worst environments are added, and the
+        program is solved again.
         """
         active = [0]
         while True:
@@ -443,10 +448,10 @@ class _Search:
             active = active + missed[:2]
 
     def between(self, candidate: Optimal) -> Optimal:
-        """Search between the vertices of the ranges, and return the coupling with a proof at each vertex.
+        """Return the coupling with a proof at each vertex of the ranges, after a search between the vertices.
 
-        If the worst environment of the search leaves less than MARGIN/2 of the damping unused, the forces are scaled
-        down. If the proof fails then and after a further scaling, the coupling is returned without a proof.
+        If the coupling leaves less than MARGIN/2 of the damping unused in the worst environment of the search, the
+        forces are scaled down. If the proof still fails after a second scaling, the coupling is returned without it.
         """
         unscaled = candidate.coupling
         assert isinstance(unscaled, ForceFilter)
@@ -467,7 +472,10 @@ class _Search:
         return last
 
     def _between_with_multipliers(self, candidate: Optimal, coupling: ForceFilter, over: Callable[[], bool]) -> Optimal:
-        """Return the coupling, scaled so that one set of multipliers serves all environments, or without a proof."""
+        """Return the coupling with a proof by one set of multipliers for all environments of the ranges, or without.
+
+        The forces are scaled down until the proof succeeds, at most _SCALINGS times. `over` ends the search.
+        """
         last = candidate
         for _ in range(_SCALINGS):
             needs = required_damping(self.loop, coupling, self.condition)
@@ -487,7 +495,7 @@ class _Search:
         return replace(last, certificate=None, reason=last.reason or "no scaling of its forces is proved in the ranges")
 
     def scaled(self) -> Optimal:
-        """Return the coupling R = kappa I. If it is not proved, kappa is reduced, by at most half, until it is."""
+        """Return the coupling R = kappa I. If its proof fails, smaller kappa are tried, down to half of the first."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)
@@ -504,7 +512,7 @@ class _Search:
         return result
 
     def spring_damper(self) -> Optimal | None:
-        """Return the best spring-damper; None if there is none, or with ranges, a latency or further constraints."""
+        """Return the best spring-damper. With ranges, a latency or further constraints the result is None."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
@@ -514,16 +522,23 @@ class _Search:
 
     @property
     def known(self) -> KnownDevice:
+        """The condition known-device, with limited forces if the options contain the limiter."""
         return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
 
     def multipliers(self, coupling: Coupling) -> tuple[float, ...]:
-        """Return the facts' multipliers with which known-device requires the least damping, or their start values."""
-        found = self.known.required(self.loop, coupling).multiplier
+        """Return the facts' multipliers with which known-device requires the least damping.
+
+        If no multipliers are found, the result is their start values.
+        """
+        best = self.known.required(self.loop, coupling).multiplier
         usual = [value for each in self.known.unknowns(self.loop) for value in each.start or each.units]
-        return tuple(found[3 * self.loop.channels :] if found else usual)
+        return tuple(best[3 * self.loop.channels :] if best else usual)
 
     def over_known(self, eta: float, multipliers: Sequence[float], error: float, taps: int, poles: int) -> Optimal:
-        """Return the optimum over a basis for beta = `eta` times the largest beta and these facts' multipliers."""
+        """Return the best coupling over a basis for fixed beta and multipliers of the facts.
+
+        beta is `eta` times the largest beta, and `error` is the mismatch of the best coupling so far.
+        """
         loop = self.loop
         largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # All axes of a device share beta.
         beta = np.array(loop.per_channel((eta * largest).tolist()))
@@ -545,7 +560,10 @@ class _Search:
         return self._assessed(coupling, whole)
 
     def scaled_and_proved(self, candidate: Optimal) -> Optimal:
-        """Scale the forces down until known-device is proved with the best beta, at most _SCALINGS times."""
+        """Return the coupling with a proof of known-device for the best beta, or without.
+
+        The forces are scaled down until the proof succeeds, at most _SCALINGS times.
+        """
         coupling = candidate.coupling
         assert isinstance(coupling, ForceFilter)
         for _ in range(_SCALINGS):
@@ -556,10 +574,10 @@ class _Search:
         return candidate
 
     def _start(self, problem: program.Problem) -> Array:
-        """Return unknowns of R = kappa I that satisfy every constraint strictly.
+        """Return the unknowns of a coupling R = kappa I that satisfies every constraint strictly.
 
-        For F = 0 every constraint holds strictly. For LimitedForces the Schur complement is
-        rho (Re M/z - beta/4), where the multiplier M satisfies Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
+        Some kappa > 0 does, because F = 0 satisfies every constraint strictly. For LimitedForces with F = 0 the Schur
+        complement is rho (Re M/z - beta/4). Its multiplier M has Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         grids = [problem.grid(part) for part in problem.parts]
@@ -568,9 +586,9 @@ class _Search:
         return start
 
     def _assessed(self, coupling: Coupling, multiplier: Sequence[float] | None = None) -> Optimal:
-        """Return the coupling with its figures and its swept requirement, without a proof.
+        """Return the coupling with its figures and its required damping from a sweep, without a proof.
 
-        For known-device, `multiplier` holds beta, zeros in place of the bounds of q (`known_device._q_bounds`), and
+        For known-device, `multiplier` contains beta, zeros in place of the bounds of q (`known_device._q_bounds`), and
         the facts' multipliers. If `multiplier` is None, beta and the facts' multipliers are searched.
         """
         loop, members = self.loop, self.loop.members()
@@ -619,11 +637,12 @@ class _Search:
 
 
 def _felt(g: float) -> float:
+    """Return g, or 0 if nobody would feel a stiffness of the share g of the environment's."""
     return g if g >= _FELT_STIFFNESS else 0.0
 
 
 def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
-    """Return the filter times `scale`, rounded to decimals for which R(1) = g I holds exactly."""
+    """Return the filter times `scale`, with coefficients in decimals, such that R(1) = g I holds exactly."""
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
     return program.Span(coupling.poles, coupling.pairs, every).filter(
         np.append(coupling.g, coupling.R[1:].ravel()), scale

@@ -1,9 +1,9 @@
 """The convex program of the optimal coupling (design.optimal), whose force filter R gives F = Theta R Psi E.
 
-R is a sum over a basis with unknown coefficients. All constraints are affine in R, and R = kappa I satisfies each of
-them for a small kappa, so a start always exists. Each constraint is a linear matrix inequality at every frequency.
-design.barrier solves the program on a grid of frequencies, and a dense sweep adds the frequencies at which the solution
-violates a constraint.
+R is a sum of basis functions with unknown coefficients. All constraints are affine in R, and R = kappa I satisfies each
+of them for a small kappa, so that a feasible start always exists. Each constraint is a linear matrix inequality at
+every frequency. design.barrier solves the program on a grid of frequencies, and a dense sweep adds the frequencies at
+which the solution violates a constraint.
 """
 
 from __future__ import annotations
@@ -43,37 +43,39 @@ from haptic_loop.design.transparency import BAND_HZ, in_band
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
 _BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
-_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # largest and least distance of real poles to 1, by basis
-_FASTER = 0.25  # With many channels, real modes of smaller radius are only in the filter of the sum of all forces.
+_FASTEST, _SLOWEST = 0.5, 0.008  # largest and least distance of a real pole to 1
+_SLOWEST_OF_LARGE = 0.0015  # least distance of a real pole to 1 in a basis with sections at the band's end
+_FASTER = 0.25  # With many channels, only the filter of the sum of all forces has real modes of smaller radius.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
-_RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
-_EDGED = {1: 20, 2: 20}  # least number of taps of a basis with sections at the band's end, by number of channels
+_RICH = 8  # largest number of channels for which a basis has second-order sections at the band's end
+_EDGED = {1: 20, 2: 20}  # number of channels -> least number of taps of a basis with sections at the band's end
 _EDGED_OF_MANY = 6  # least number of taps of such a basis for more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of the sections; small, because the error may jump at the band's end
-# Up to FULL channels (FULL_BESIDE with further constraints, a latency or ranges) R has a filter for each pair of them.
+# Up to FULL channels R has a filter for each pair of channels. With further constraints, a latency or ranges the limit
+# is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the mismatch, up to _RICH channels and above
-HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.
-SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch so far, SOFT[1]).
+HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (`most_gain`) keeps the force low.
+SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch of the best coupling so far, SOFT[1]).
 _EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
-_LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the norm of E
-_SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
+_LEAST_FORCE = 0.01  # least force that `_evened` assumes for a motion, as a share of the norm of E
+_SMALL = 1e-5  # weight of R's coefficients. Without it some would be arbitrary if the environment has no inverse.
 _DECIMALS = 10  # decimal places of g and of R's coefficients
-# Duality gaps before the first and before each later sweep, relative to the objective, or to the difference between the
-# objectives of zero force and of the solution, whichever is less.
+# Duality gaps before the first sweep and before each later sweep. They are relative to the objective, or, if this is
+# less, to the difference between the objectives of zero force and of the solution.
 _GAPS = (0.05, 0.01)
-# Allowed violation of an inequality between the frequencies of its grid, if scaling removes it and if `_kept` does,
-# which loses 30 times as much.
+# Allowed violation of an inequality between the frequencies of its grid. The first number holds if the caller scales
+# the forces down. The second holds for `_kept`, which loses 30 times as much.
 _FORGIVEN, _FORGIVEN_OF_MORE = 5e-4, 1e-4
-_STEEPER = 3.0  # factor between successive weights of the barrier method
+_STEEPER = 3.0  # factor between successive t of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency
 _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]; the matrices are constant below it
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the design of an optimal coupling. Raises TypeError or ValueError with the name of a wrong field."""
+    """Options of the design of an optimal coupling. TypeErrors and ValueErrors name the wrong field."""
 
     objective: Literal["rms", "sup"] = "rms"  # norm of the mismatch relative to the environment, over the band
     band_hz: tuple[float, float] = BAND_HZ
@@ -97,14 +99,14 @@ DEFAULT = Options()
 
 @dataclass(frozen=True, eq=False)
 class _Constraint:
-    """The constraint He[block(G, x)] > 0 at every frequency, affine in G = R Psi E and its own unknowns x."""
+    """The constraint He[block(G, x)] > 0 at every frequency, affine in G = R Psi E and in its own unknowns x."""
 
     name: str
     block: Callable[[Sampled, Array], Sampled]
-    unit: Array  # (r,) scale of the block's rows and columns, so that its eigenvalues have one unit
+    unit: Array  # (r,) scale of the block's rows and columns, which makes its entries dimensionless
     low: float = _SMALLEST  # [rad/sample] least frequency
     high: float = np.pi  # [rad/sample] largest frequency
-    start: tuple[float, ...] = ()  # own unknowns with which R = kappa I is strictly feasible for a small kappa
+    start: tuple[float, ...] = ()  # own unknowns, with which R = kappa I is strictly feasible for a small kappa
     cost: tuple[float, ...] = ()  # coefficients of the own unknowns in the objective
     through: bool = False  # whether the block is a constant plus L(z) G, with one row for each force
 
@@ -117,7 +119,7 @@ class _Constraint:
 
 
 def this_environment(loop: Loop) -> _Constraint:
-    """Return this-environment as a constraint with the share MARGIN of the damping unused, in units of Delta/T_max."""
+    """Return this-environment as a constraint, which leaves the share MARGIN of the damping unused."""
 
     def block(G: Sampled, own: Array) -> Sampled:
         demand = this_environment_demand(loop.late(G), loop)
@@ -130,12 +132,12 @@ def this_environment(loop: Loop) -> _Constraint:
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """Return SWITCHING as a constraint for delays that switch within the span.
 
-    Its own unknowns are the multipliers alpha of the devices whose delay varies, in units of delta/T_max with the least
-    delta of the device's axes.
+    Its own unknowns are the multipliers alpha of the devices whose delay varies. The unit of alpha is delta/T_max with
+    the least delta of the device's axes.
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
-    # Each channel whose delay varies has a further input, w of design.facts.Switching.
+    # Each channel with a varying delay has a further input, the w of design.facts.Switching.
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
     (multiplier,) = SWITCHING.unknowns(switched)
     units = np.array(multiplier.units)  # (devices,), 0 where the delay is constant
@@ -153,10 +155,10 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
 
 @dataclass(frozen=True)
 class Slip:
-    """Stiffness and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
+    """Stiffness and multiplier of a limiter. If both are fixed, the limiter's block is affine in the forces."""
 
-    beta: float  # rho of a device is beta/T times its least damping (LimitedForces.rho)
-    c: tuple[tuple[float, ...], ...]  # (devices, lags)
+    beta: float  # The limiter's stiffness rho is beta/T times the least damping of the device (LimitedForces.rho).
+    c: tuple[tuple[float, ...], ...]  # (devices, lags) multiplier
 
     @property
     def condition(self) -> LimitedForces:
@@ -168,7 +170,7 @@ class Slip:
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
-    """Return LimitedForces as a constraint with the share MARGIN of the damping and 2 % of rho unused."""
+    """Return LimitedForces as a constraint, which leaves the share MARGIN of the damping and 2 % of rho unused."""
     condition, c = slip.condition, [v for row in slip.c for v in row]
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -180,7 +182,10 @@ def limiter(loop: Loop, slip: Slip) -> _Constraint:
 
 
 def known_device(loop: Loop, condition: KnownDevice, beta: Array, multipliers: Sequence[float]) -> _Constraint:
-    """Return known-device at fixed beta (m,) [s] and multipliers, with the share MARGIN of the damping unused."""
+    """Return known-device as a constraint for fixed beta (m,) [s] and multipliers of the facts.
+
+    The constraint leaves the share MARGIN of the damping unused.
+    """
     values = named_parts(condition.unknowns(loop), multipliers)
     hands = KnownMotor(period_cost(loop, 1 - MARGIN, beta), beta)
 
@@ -216,7 +221,10 @@ def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Const
 
 
 def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
-    """Return a block with the Hermitian part [[cap I, M/|E|], [., cap I]]: |M| < cap |E| in the spectral norm."""
+    """Return a block whose Hermitian part is [[cap I, M/|E|], [(M/|E|)*, cap I]].
+
+    This part is positive definite if and only if |M| < cap |E| in the spectral norm.
+    """
     m = M.G.shape[-1]
     S = np.zeros((*M.G.shape[:-2], 2 * m, 2 * m), dtype=complex)
     S[..., np.arange(2 * m), np.arange(2 * m)] = cap
@@ -229,22 +237,25 @@ def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Basis functions of R, and the entries of R_1, R_2, .. that are unknowns; the first unknown is g."""
+    """The basis functions b_j of R = sum_j b_j R_j, and the entries of R_1, R_2, .. that are unknowns.
+
+    The first unknown is g. R_0 follows from R(1) = g I, because b_j(1) = 1.
+    """
 
     poles: Array  # (n,) real poles; 0 for a tap
     pairs: Array  # (p, 2) coefficients a, b of z^2 + a z + b
-    used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1) whether an entry is an unknown; the others are 0
+    used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1) whether an entry is an unknown; all other entries are 0
 
     @property
     def unknowns(self) -> int:
         return 1 + int(self.used.sum())
 
     def responses(self, z: Complex) -> Complex:
-        """Return b_j(z) - 1 for j >= 1, (k, n + 2 p): the factors of R_j where R_0 = g I - R_1 - R_2 - ..."""
+        """Return b_j(z) - 1 for j >= 1, (k, n + 2 p): the factors of the R_j, since R_0 is g I - R_1 - R_2 - .."""
         return basis(self.poles, z, self.pairs)[:, 1:] - 1
 
     def sources(self) -> Array:
-        """Return the filters' inputs as rows over the forces, (m or m + 1, m): each force; row m + 1 is their sum."""
+        """Return the filters' inputs as a map from the forces, (m or m + 1, m): each force, then perhaps their sum."""
         m, columns = self.used.shape[1:]
         return np.vstack([np.eye(m), np.ones((columns - m, m))])
 
@@ -255,7 +266,7 @@ class Span:
         return R
 
     def filter(self, x: Array, scale: float = 1.0) -> ForceFilter:
-        """Return the force filter times `scale` in decimals, with R_0 such that R(1) = g I holds exactly."""
+        """Return the force filter times `scale`, with coefficients in decimals. R_0 is such that R(1) = g I exactly."""
         unit = 10**_DECIMALS
         later = np.array([round(v * unit) for v in (scale * self.matrices(x)).ravel().tolist()], dtype=object)
         later = later.reshape(self.used.shape)
@@ -267,17 +278,17 @@ class Span:
 
     def chain(self, T: float) -> Lti:
         """Return a block with the poles of the basis; T in s."""
-        one = np.append(np.zeros(len(self.used)), 1.0)[:, None, None]  # The last function contains every section.
+        one = np.append(np.zeros(len(self.used)), 1.0)[:, None, None]  # The last function has all poles.
         return ForceFilter(self.poles, self.pairs, one).filter(T)
 
 
 def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int = FULL) -> Span:
     """Return a basis of taps, real poles, and the modes of E and of its inverse.
 
-    The real poles are evenly spaced in the logarithm of their distance to 1; those near a real mode are dropped. All
-    poles are rounded to decimals. Large bases for at most _RICH channels also have slower poles, and sections at the
-    band's end. With more than `full` channels every device has a filter of its own force and a filter of the sum of all
-    forces. Only the latter has the fast real modes.
+    The real poles are evenly spaced in the logarithm of their distance to 1. Real poles near a real mode are dropped.
+    All poles are rounded to decimals. Large bases for at most _RICH channels also have slower poles, and sections at
+    the band's end. With more than `full` channels every channel has a filter of its own force and a filter of the sum
+    of all forces. Only the filter of the sum has the fast real modes.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
@@ -299,7 +310,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
-    # The fast real modes come last, because the filters of the devices' own forces end before them.
+    # The fast real modes come last, because the filters of the channels' own forces end before them.
     pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
@@ -312,13 +323,13 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
 
 
 def _zeros(E: Lti) -> Complex:
-    """Return the poles of E^-1; a millionth of E's feedthrough is added to its diagonal so that the inverse exists."""
+    """Return the poles of E^-1. A millionth of E's feedthrough is added to its diagonal, so that the inverse exists."""
     D = E.D + 1e-6 * max(float(np.trace(E.D)) / E.inputs, 1e-12) * np.eye(E.inputs)
     return np.linalg.eigvals(E.A - E.B @ np.linalg.solve(D, E.C)).astype(complex)
 
 
 def _separate(modes: Complex) -> list[complex]:
-    """Drop each mode nearer to an earlier mode than 5 % of the earlier mode's distance to the unit circle."""
+    """Return the modes without those that are too close to an earlier one: 5 % of its distance to the unit circle."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
@@ -327,7 +338,7 @@ def _separate(modes: Complex) -> list[complex]:
 
 
 _Part = tuple["Case", _Constraint, slice]  # a constraint in a case, and the indices of its own unknowns
-_Posed = tuple[Program, Array, Callable[[Array], Array]]
+_Posed = tuple[Program, Array, Callable[[Array], Array]]  # a program in unknowns y, a feasible y, the map from y to x
 
 # the problem -----------------------------------------------------------------------------------------------------
 
@@ -347,16 +358,17 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Objective and inequalities in the unknowns [g, R_1, R_2, .., own unknowns of the constraints]."""
+    """Objective and constraints in the unknowns x = [g, R_1, R_2, .., own unknowns of the constraints]."""
 
     span: Span
-    cases: tuple[Case, ...]  # Only the mismatch in the first environment is minimised.
+    cases: tuple[Case, ...]  # The objective is the mismatch in the first environment.
     options: Options
     soft: float  # weight of the force above 100 Hz
     heavier: float = 1.0  # factor on the weight of the static stiffness
 
     @cached_property
     def parts(self) -> list[_Part]:
+        """Every constraint of every case."""
         parts, end = list[_Part](), self.span.unknowns
         for case in self.cases:
             for constraint in case.constraints:
@@ -374,10 +386,11 @@ class Problem:
         return np.array([kappa, *np.zeros(self.span.unknowns - 1), *own])
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness, size of R.
+        """Return A, b, c of |A x - b|^2 + c'x, a sum of mismatch, soft rows, lost static stiffness and size of R.
 
-        Each device's row of R is a separate least-squares problem, which is reduced to its triangular factor. They
-        share only g, so that A has few more rows than unknowns.
+        The mismatch is its square if the objective is the rms, or the own unknown r of `worst_mismatch`. Each channel's
+        row of R is a separate least-squares problem, which is reduced to its triangular factor. The problems share only
+        g, so that A has hardly more rows than unknowns.
         """
         parts = self._weighed()
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
@@ -398,9 +411,10 @@ class Problem:
         return np.vstack([*rows, of_g]), np.concatenate([*right, [held, 0.0]]), cost
 
     def _weighed(self) -> list[tuple[Array, Complex, Complex]]:
-        """Return parts (w, L, target L) of the objective |F L - target L|^2.
+        """Return terms (w, L, target L) of the objective sum |F L - target L|^2 over the frequencies w.
 
-        L contains weight/|E|, and for the mismatch also `_evened`; the target of soft rows is zero.
+        L contains weight/|E|, and for the mismatch also `_evened`. The target of the mismatch is Lambda E, and that of
+        soft rows is zero.
         """
         case, weights = self.cases[0], list[tuple[Array, Complex, Complex]]()
 
@@ -423,7 +437,7 @@ class Problem:
         return weights
 
     def _force_rows(self, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
-        """Return row i of F L for each of the unknowns `mine`, and row i of `target`, as real rows."""
+        """Return the derivatives of row i of F L by the unknowns `mine`, and row i of `target`, as real columns."""
         case, z = self.cases[0], on_circle(w)
         moved = case.delayed(z).G[0] @ L * (z ** -float(case.loop.theta[i]))[:, None, None]
         functions, signals = self.span.responses(z), self.span.sources() @ moved
@@ -446,7 +460,7 @@ class Problem:
         return Sampled(z[None], G, case.loop.T)
 
     def block(self, part: _Part, w: Array) -> MatrixInequality:
-        """Return the inequality of a constraint at the frequencies w, from the block at each unit vector."""
+        """Return the inequality of a constraint at the frequencies w, from its values at the unit vectors of x."""
         case, constraint, own = part
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own.stop - own.start)
@@ -466,21 +480,21 @@ class Problem:
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
     def _dense(self, A: Array, b: Array, c: Array, imposed: list[Array], x: Array) -> _Posed:
-        """Return (program in well-conditioned coordinates y, feasible y of x, map from y to x)."""
+        """Return the program in well-conditioned unknowns y, for any constraints."""
         parts = [self.block(part, w) for part, w in zip(self.parts, imposed, strict=True)]
         program, U = Program(A, b, c, joined([*parts, self._positive(0)])).conditioned(x)
         return program, U @ x, lambda y: solve_triangular(U, y)
 
     @property
     def _entries(self) -> bool:
-        """Whether `_by_entries` applies: R is full, m > 2, and every block is a constant plus L(z) G."""
+        """Whether `_by_entries` is possible: m > 2, all entries of R are unknowns, and all blocks have `through`."""
         full = self.span.used.all() and self.span.used.shape[1] == self.span.used.shape[2] > 2
         return bool(full) and all(constraint.through for _, constraint, _ in self.parts)
 
     def _by_entries(self, A: Array, b: Array, c: Array, imposed: list[Array], x: Array) -> _Posed:
-        """Return (program, feasible y of x, map from y to x), with y ordered by entries of R, then g.
+        """Return the program in unknowns y, which are sorted by entries of R, then g.
 
-        The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
+        The basis functions are orthogonalised, and the inequalities are EntryInequalities, which are faster for m > 2.
         """
         n, m, _ = self.span.used.shape
         z = on_circle(np.unique(np.concatenate(imposed)))
@@ -511,7 +525,7 @@ class Problem:
         return program, there(x), back
 
     def least(self, part: _Part, x: Array, w: Array) -> Array:
-        """Return the least eigenvalue of a constraint at x for each frequency w, (k,)."""
+        """Return the least eigenvalue of a constraint's block at x for each frequency w, (k,)."""
         case, constraint, own = part
         spend(_POINT * w.size)
         z = on_circle(w)
@@ -534,17 +548,17 @@ class Problem:
         return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]
 
     def room(self, x: Array, grids: Iterable[Array]) -> float:
-        """Return the least eigenvalue of all constraints at x, each on its own grid of frequencies."""
+        """Return the least eigenvalue of all constraints' blocks at x, each on its own grid of frequencies."""
         parts = zip(self.parts, grids, strict=True)
         return min(float(self.least(part, x, w).min(initial=np.inf)) for part, w in parts)
 
     def sweep(self, part: _Part) -> Array:
-        """Return a dense grid that resolves every pole, over the band of a constraint [rad/sample]."""
+        """Return a dense grid over the frequencies of a constraint [rad/sample], which resolves every pole."""
         case, constraint, _ = part
         return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
-        """Return (frequencies of the violations of each constraint in each case, largest violation)."""
+        """Return (frequencies at which x violates each of the `parts`, largest violation)."""
         missing, worst = [], 0.0
         for part in self.parts:
             fails = lambda w, part=part: -self.least(part, x, w)  # noqa: E731
@@ -553,15 +567,15 @@ class Problem:
         return missing, worst
 
     def solve(self, start: Array) -> Array:
-        """Return the optimum from a strictly feasible start.
+        """Return the optimal x, from a strictly feasible start.
 
-        If PROGRAM_SWEEPS rounds are not enough, larger violations are left to `_kept` or to the caller.
+        After PROGRAM_SWEEPS rounds x may still violate constraints. With several constraints in an environment, `_kept`
+        removes the violations. Otherwise the caller scales the forces down.
         """
         imposed = [self.grid(part) for part in self.parts]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
         nothing = float(b @ b) + float(c.any())  # objective of zero force, whose relative mismatch is 1
-        # With one constraint per environment, the caller scales the forces down.
         demanding = any(len(case.constraints) > 1 for case in self.cases)
         path, gaps, inner, x = list[tuple[Array, float]](), list(_GAPS), start, start
         for _ in range(budgets.PROGRAM_SWEEPS):
@@ -587,9 +601,10 @@ class Problem:
         return self._kept(inner, start, x) if demanding else x
 
     def _kept(self, inner: Array, start: Array, x: Array) -> Array:
-        """Return a point between x and an interior point; it satisfies the constraints on the dense sweep.
+        """Return a point on the line from x to an interior point that satisfies all constraints on the dense sweep.
 
-        The least eigenvalue is concave along this line, so its values at both ends give the length of the step.
+        The least eigenvalue is concave along this line. So its values at both ends determine how far from x the point
+        has to be. The interior point is `inner` if that is feasible, or `start`.
         """
         _, worst = self.missed(x)
         for base in (inner, start):
@@ -599,10 +614,10 @@ class Problem:
 
 
 def _evened(E: Complex, size: Array) -> Complex:
-    """Return L, which adds to the mismatch M the errors in motions with small forces: |M L|^2 = |M|^2 + addition.
+    """Return L (k, m, m), with which |M L|^2 is |M|^2 plus a weight of the errors in motions with small forces.
 
-    Divided by |E|^2, the addition is _EVEN times the mean of |M v|^2/(|E v|^2 + _LEAST_FORCE^2 |E|^2) over the m right
-    singular vectors v of E. Without it, couplings with nearly the same mismatch may differ much in these motions.
+    Divided by |E|^2, this weight is _EVEN times the mean of |M v|^2/(|E v|^2 + _LEAST_FORCE^2 |E|^2) over the m right
+    singular vectors v of E. Without it, couplings with nearly the same mismatch M may differ much in these motions.
     """
     unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
     faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)
@@ -610,5 +625,5 @@ def _evened(E: Complex, size: Array) -> Complex:
 
 
 def static_weight(loop: Loop) -> float:
-    """Return the weight of the lost static stiffness, g - 1, beside the mismatch."""
+    """Return the weight of g - 1, the lost static stiffness, in the objective."""
     return _STATIC if loop.channels <= _RICH else _STATIC_OF_MANY

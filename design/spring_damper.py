@@ -1,8 +1,8 @@
-"""Design spring-dampers (26) of least objective or of largest stiffness, and moving averages.
+"""Design spring-dampers (26) of least mismatch or of largest stiffness, and moving averages.
 
 `_GainSet` is the convex set of gains that any-environment certifies, in units of the usable damping
-d = (1 - RESERVE) delta T/T_max: k = K T/d, b = B/d. For this-environment and known-device, `design` uses the search of
-design.gain_search.
+d = (1 - RESERVE) delta T/T_max [N s/m]: k = K T/d, b = B/d. For this-environment and known-device, `design` uses the
+search of design.gain_search.
 """
 
 from __future__ import annotations
@@ -51,35 +51,36 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel (docs/theory.md).
 #
-# A channel has V = 1/g with g = k + b (1 - 1/z). Times g and its conjugate, the condition is k/2 + b >= |c|^2 on the
-# circle with the c of `_Channel.rows`, which is affine in k and b. `lemma1` turns it into one matrix inequality. If the
-# entries of its storage matrices are more than _MOST_STORED, the condition is imposed at sampled frequencies instead,
-# and frequencies at which the solution violates it are added. Both methods give the same gains.
+# A channel has V = 1/g with g = k + b (1 - 1/z). The condition, multiplied by g and its conjugate, is
+# k/2 + b >= |c|^2 on |z| = 1. The vector c is that of `_Channel.rows` and is affine in k and b. `lemma1` turns the
+# condition into one matrix inequality with a storage matrix for each channel. If these have more than _MOST_STORED
+# entries, the condition is imposed at sampled frequencies instead, and frequencies at which the solution violates it
+# are added. Both methods give the same gains.
 
 
 _MOST_STORED = 180  # largest number of entries of all channels' storage matrices
-_PER_LOBE = 8  # initial frequencies per ripple of a delay
-_MISSED = 2e-6  # allowed violation between frequencies, relative to the usable damping; far below a design's reserve
+_PER_RIPPLE = 8  # number of initial frequencies for each ripple of |c|^2; a delay of n samples causes n + 1 ripples
+_MISSED = 2e-6  # allowed violation between frequencies, relative to the usable damping; far below RESERVE
 
 
 @dataclass(frozen=True)
 class _Channel:
-    """The gains (k, b) of one channel, in units of its usable damping."""
+    """The set of gains (k, b) of one channel, in units of its usable damping."""
 
-    theta: int
-    shortage: float  # the channel's phi over its usable damping; 0 if psi = 0
+    theta: int  # delay [samples]
+    shortage: float  # phi of the channel (design.environments.least_phi) over its usable damping; 0 if psi = 0
 
     def rows(self, gains: Array) -> Lti:
         """Return c(z) of the condition k/2 + b >= |c|^2 on |z| = 1; only its matrices C and D depend on the gains."""
         k, b = gains
-        late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
+        late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line, whose coefficients are in D and C
         window = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
         if not self.shortage:
             return window
         return vstack(window, (np.eye(1) - window) * (1 / np.sqrt(1 / self.shortage - 1)))
 
     def exactly(self, unknowns: Sequence[int]) -> Inequality:
-        """Return the inequality at all frequencies; the unknowns after k and b are entries of a storage matrix."""
+        """Return the inequality for all frequencies. The unknowns are k, b and the entries of a storage matrix."""
 
         def matrix(x: Array) -> Array:
             c = self.rows(x[:2])
@@ -110,12 +111,15 @@ class _Channel:
         return peaks(excess, self.grid(2), _MISSED)
 
     def grid(self, finer: int = 1) -> Array:
-        """Return frequencies from 0 to pi [rad/sample], _PER_LOBE for each ripple."""
-        return np.linspace(0, np.pi, finer * _PER_LOBE * (self.theta + 1) + 1)
+        """Return frequencies from 0 to pi [rad/sample], `finer` times _PER_RIPPLE for each ripple."""
+        return np.linspace(0, np.pi, finer * _PER_RIPPLE * (self.theta + 1) + 1)
 
 
 class _GainSet:
-    """The gains that any-environment certifies, in units of the usable damping, with phi (m,) [N s/m] if psi >= 1."""
+    """The gains that any-environment certifies, in units of the usable damping.
+
+    phi (m,) [N s/m] is the multiplier for psi >= 1, or None for psi = 0.
+    """
 
     def __init__(self, loop: Loop, phi: Array | None = None, most_stored: int = _MOST_STORED) -> None:
         shortage = np.zeros(loop.channels) if phi is None else phi / usable(loop)
@@ -124,10 +128,11 @@ class _GainSet:
         self._stored = stored if stored.sum() <= most_stored else None
 
     def solve(self, cost: Array, what: str, more: Sequence[Inequality] = ()) -> Array:
-        """Return the unknowns of least cost. The first are the gains (k_1, ..., k_N, b_1, ..., b_N) of N channels.
+        """Return the unknowns x with the least cost'x; `what` names the problem in error messages.
 
-        The gains are in their sets, and all unknowns satisfy the inequalities `more`. Raises the errors of
-        ConeProgram.solve, and DesignFailed if the gains violate an inequality after all rounds.
+        The first unknowns are the gains (k_1, ..., k_N, b_1, ..., b_N) of N channels, which any-environment certifies.
+        All unknowns satisfy the inequalities `more`. Raises the errors of ConeProgram.solve, and DesignFailed if the
+        gains still violate an inequality after THEOREM_4_ROUNDS rounds.
         """
         N, own = len(self.channels), len(cost)
         blocks = [*more, Inequality.least(range(2 * N), 0.0)]
@@ -150,9 +155,9 @@ class _GainSet:
 
 
 # ----------------------------------------------------------------------------------------------------
-# One step of the convex-concave sequence for ||L W2||_inf (23) over spring-damper gains (docs/theory.md). With
-# g = k + b (1 - 1/z) per channel the norm is at most mu iff (L g W2)* (L g W2) <= mu^2 g* g on |z| = 1. A step replaces
-# g* g by its tangent at the previous gains, which lies below g* g, so that no step increases the norm.
+# One step of the convex-concave sequence for ||L W2||_inf (23) over spring-damper gains (docs/theory.md). Let
+# g = diag(k + b (1 - 1/z)). The norm is at most mu if and only if (L g W2)* (L g W2) <= mu^2 g* g on |z| = 1. A step
+# replaces g* g by its tangent at the previous gains. The tangent lies below g* g, so that no step increases the norm.
 
 
 def _step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
@@ -163,7 +168,10 @@ def _step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -
 
 
 def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
-    """Return [[g0* g + g* g0 - g0* g0, (L g W2)*], [L g W2, t norm^2 I]] >= 0, scaled; t is the last unknown."""
+    """Return [[g0* g + g* g0 - g0* g0, (L g W2)*], [L g W2, t norm^2 I]] >= 0 at the frequencies w, scaled.
+
+    g0 is g at the gains `at`. The unknowns are the gains and t = mu^2/norm^2.
+    """
     N = shaping.loop.channels
     environment, weight, late = shaping.parts(w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
@@ -184,7 +192,8 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return Inequality(constant, slopes, range(2 * N + 1))
 
 
-_SETTLED = 1e-6  # The sequence ends if a step changes the norm by a smaller share, and its bound is as near.
+#: The sequence ends if a step changes the norm by a smaller share, and the norm is as close to the step's bound.
+_SETTLED = 1e-6
 _NEGLIGIBLE = 1e-6  # Dampers below this share of the usable damping become 0, because solvers return 1e-9 for 0.
 
 
@@ -196,22 +205,23 @@ def design(
 ) -> Design:
     """Return the spring-damper of least objective that `condition` certifies.
 
-    any-environment reduces ||L W2||_inf (23) over the exact set of gains (for psi >= 1, the set for one Phi) until the
-    norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is reached
-    from several starts, or with more than FEW channels the first minimum found. known-device-any maximises the sum of
-    K.
+    For any-environment the objective is ||L W2||_inf (23), over the exact set of gains, or for psi >= 1 over the set
+    for one multiplier Phi. For this-environment and known-device the objective is the rms mismatch, and the result is
+    the lowest of the local minima that are reached from several starts, or with more than FEW channels the first
+    minimum. For known-device-any the objective is the negative sum of K.
 
     Args:
         loop: The devices, their delays and the environment. Only this-environment allows delays that switch.
         condition: The name of a condition.
-        limiter: Whether the design must cover limited forces, too (None: if possible); any-environment does if psi = 0.
-        band_hz: The band of the rms mismatch [Hz].
+        limiter: Whether the coupling must be safe while forces are limited, too. With None the search for such gains
+            may fail; the coupling is then safe below the limits only. For psi = 0 any-environment always covers limits.
+        band_hz: The band of the rms mismatch [Hz], or None for BAND_HZ.
 
     Raises:
         Infeasible: Theorem 4 admits no gains.
-        DesignFailed: No gains were found, any-environment or known-device does not certify them, or the loop has so
-            many channels that the search would take minutes.
-        ValueError: No design of the condition exists for the limiter or for another argument.
+        DesignFailed: No gains were found, the condition does not certify them, or the loop has so many channels that
+            the search would take minutes.
+        ValueError: The condition has no designs for limited forces or for this band.
     """
     chosen = named(condition)
     if chosen.extensible:
@@ -234,10 +244,10 @@ def design(
     return _stiffest_known(loop) if chosen is KNOWN_DEVICE_ANY else _for_any_environment(loop)
 
 
-#: Number of significant digits of the gains in loops of more than FEW channels, because exact proofs with all digits
-#: take minutes. Rounding changes the required damping by less than RESERVE.
+#: Number of significant digits of the gains in loops of more than FEW channels. With all digits exact proofs would take
+#: minutes. Rounding changes the required damping by less than RESERVE.
 _DIGITS = 5
-_SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
+_SWEEPS = 150  # A search for this-environment takes about as long as this number of frequency sweeps.
 _MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a search ends within half a minute
 
 
@@ -287,11 +297,8 @@ def _without_negligible(loop: Loop, coupling: SpringDamper) -> SpringDamper:
 
 
 def _for_this_environment(loop: Loop, limiter: bool | None, band_hz: tuple[float, float] | None) -> Design:
-    """Return the spring-damper of least rms mismatch that this-environment certifies.
-
-    If `limiter` is not False, it covers limited forces, or with None those below the limits if no such gains are found.
-    """
-    each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
+    """Return the spring-damper of least rms mismatch that this-environment certifies (see `design` for `limiter`)."""
+    each = np.full(loop.channels, 1000.0)  # The time of a sweep does not depend on the gains.
     if reason := budgets.too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
         raise DesignFailed(None, (), reason)
     starts, band, span = _starts(loop), band_hz or BAND_HZ, loop.varying_delay
@@ -329,7 +336,7 @@ def _for_this_environment(loop: Loop, limiter: bool | None, band_hz: tuple[float
 
 
 def _no_gains(loop: Loop, certifies: str) -> DesignFailed:
-    """Return the error of a search without result; `certifies` names the condition, with a verb."""
+    """Return the error of a search that found no gains. `certifies` is the condition with a verb, for the message."""
     which = f"theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
     return DesignFailed(None, (), f"no spring-damper was found that {certifies} for {which}")
 
@@ -358,13 +365,14 @@ def _for_known_devices(loop: Loop, band_hz: tuple[float, float] | None) -> Desig
 
 
 _ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried beta/(largest beta)
-_ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
+_ON_CIRCLE = 721  # number of frequencies from 0 to pi at which known-device-any is imposed
 
 
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
-    """Return the bound (k, m) [m/N] that He[V/(1-z)] must exceed, for each frequency and channel.
+    """Return chi (k, m) [m/N], which He[V/(1-z)] must exceed for each frequency and channel.
 
-    It is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    chi is l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1. Lam is the 2 x 2 matrix of the cost L
+    (design.facts.PeriodCost).
     """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
@@ -378,8 +386,9 @@ def _stiffest_known(loop: Loop) -> Design:
     """Return the stiffest spring-damper that known-device-any certifies; the objective is the sum of K [N/m].
 
     Let D = (1 - 1/z)/T and W = K/D + B, so that V = 1/(D W) and Re W = K T/2 + B. Then He[V/(1-z)] > chi is
-    Re W > chi |W|^2 |1 - 1/z|^2/T, a convex set of (K, B) for each beta. For a given B the largest K is the least upper
-    root of a quadratic over all frequencies. B and beta are searched.
+    Re W > chi |W|^2 |1 - 1/z|^2/T. The gains (K, B) that satisfy this form a convex set for each beta. At each
+    frequency the allowed K lie between the two roots of a quadratic, so that the largest K is the least of the upper
+    roots. B and beta are searched.
     """
     K, B = zip(*(gains for own in loop.devices for gains in _stiffest_device(_axes(loop, own))), strict=True)
     coupling = SpringDamper(_rounded(K, _STIFF_DIGITS), _rounded(B, _STIFF_DIGITS))
@@ -392,7 +401,7 @@ def _axes(loop: Loop, own: slice) -> list[Loop]:
 
 
 def _best_eta(cost: Callable[[float], float], tolerance: float) -> float:
-    """Return the share of the largest beta with the least cost, from _ETAS and a search between its best neighbours."""
+    """Return the share beta/(largest beta) of least cost: the best of _ETAS, or a better one near it."""
     from scipy.optimize import minimize_scalar  # slow to load
 
     best = int(np.argmin([cost(eta) for eta in _ETAS]))
@@ -402,7 +411,7 @@ def _best_eta(cost: Callable[[float], float], tolerance: float) -> float:
 
 
 def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
-    """Return K [N/m] and B [N s/m] of each axis of a device with the largest sum of K for any environment."""
+    """Return the gains (K [N/m], B [N s/m]) with the largest sum of K, for each axis of a device."""
     from scipy.optimize import minimize_scalar  # slow to load
 
     z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))
@@ -410,9 +419,9 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
     steps = np.abs(1 - 1 / z) ** 2 / T
 
     def stiffest(B: float, limits: Array) -> float:
-        """Return the largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, or 0.
+        """Return the largest K with K T/2 + B >= chi |K/D + B|^2 |1 - 1/z|^2/T at all frequencies, or 0.
 
-        With D = (1 - 1/z)/T, |1/D|^2 steps is T, and the real part of 1/D is T/2.
+        `limits` is chi, and `steps` is |1 - 1/z|^2/T. With D = (1 - 1/z)/T, steps/|D|^2 is T, and Re 1/D is T/2.
         """
         a, b = limits * T, (limits * steps * B - 0.5) * T
         c = limits * steps * B**2 - B
@@ -424,7 +433,7 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
         return float(high.min()) if low.max() <= high.min() else 0.0
 
     def at(eta: float) -> tuple[float, list[tuple[float, float]]]:
-        """Return (-sum of K, gains) of the best B of every axis for this share of the largest beta."""
+        """Return (-sum of K, gains of every axis) for this share of the largest beta, with the best B of every axis."""
         gains = []
         for limits in _limits(axes, eta, z, _STIFF_RESERVE):
             most = 1 / (limits * steps).max()
@@ -438,21 +447,21 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
 
 
 def _limits(axes: Sequence[Loop], eta: float, z: Complex, reserve: float) -> list[Array]:
-    """Return chi (k,) of each axis of a device for one beta: `eta` times the largest one that all axes allow."""
+    """Return chi (k,) of each axis of a device. beta is `eta` times the largest beta that all axes allow."""
     beta = eta * np.min([largest_beta(one, 1 - reserve) for one in axes], axis=0)
     share = np.full(z.size, 1 - reserve)
     return [_chi(z, one.theta, period_cost(one, share, beta), beta)[:, 0] for one in axes]
 
 
 _TAPS = 4096  # number of frequencies for the Fourier coefficients of chi
-_SLACK = 2e-4  # constant above chi, relative to the largest chi; truncation may use half of it
+_SLACK = 2e-4  # constant that is added to chi, relative to the largest chi; the truncated terms may use half of it
 
 
 def _stiffest_linear(loop: Loop) -> Design:
     """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum of 1/V_i(1) [N/m].
 
-    The coupling follows from the Fourier coefficients of chi (`_from_chi`). A small constant is added, and the series
-    is cut off where the omitted terms sum to less than half of this constant.
+    `_from_chi` computes the coupling from the Fourier coefficients of chi. A small constant is added to chi, and the
+    series is cut off where the omitted terms sum to less than half of this constant.
     """
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
@@ -467,7 +476,7 @@ def _stiffest_linear(loop: Loop) -> Design:
         each += _limits(axes, _best_eta(needed, 1e-5), z, RESERVE)
     for limits in each:
         series = np.fft.rfft(limits).real / _TAPS
-        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # bounds on the sum of each term and all later ones
+        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # largest sum of each term and all later terms
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
         channels.append(_from_chi(series[:count], 2 * _SLACK * limits.max(), loop.T))
     coupling = Compliance(Lti.diag(*channels))
@@ -475,9 +484,9 @@ def _stiffest_linear(loop: Loop) -> Design:
 
 
 def _from_chi(chi: Array, extra: float, T: float) -> Lti:
-    """Return V, with coefficients in decimals, such that He[V/(1-z)] = chi + extra/2, from the coefficients chi_k.
+    """Return V such that He[V/(1-z)] is chi + extra/2, with coefficients that are rounded to decimals.
 
-    V is V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k with V(1) = 2 chi_0 + extra.
+    With the Fourier coefficients chi_k of chi, V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, and V(1) = 2 chi_0 + extra.
     """
     weights = -2 * np.diff(np.append(chi, 0.0))
     weights[0] += extra
@@ -495,10 +504,10 @@ _STIFF_DIGITS = 6  # digits of a gain
 
 
 def _starts(loop: Loop) -> list[SpringDamper]:
-    """Return couplings from which a search starts, with 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
+    """Return couplings at which a search starts. Three have 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
 
-    d is the usable damping [N s/m]. With delay in the environment a further start is stiffer than the environment at
-    half the sampling rate, because the loop is stable if the coupling is stiffer than the environment everywhere.
+    d is the usable damping [N s/m]. With delay in the environment there is a further start, whose coupling is stiffer
+    than the environment at half the sampling rate: the loop is stable if the coupling is stiffer at all frequencies.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
@@ -509,12 +518,12 @@ def _starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-# With this e of `moving_average` ringing decays per tick by a factor of 0.5 (theta = 1) or 0.55 (theta = 2).
+# With this e of `moving_average`, ringing of the force decays per tick by 0.5 (theta = 1) or 0.55 (theta = 2).
 _SPARE_OF_SLOW_WORLDS = 0.25
 
 
 def _spare(loop: Loop) -> float:
-    """Return e of `moving_average`: a rounding reserve, or more if the world stands still between its steps."""
+    """Return e of `moving_average`: a reserve for rounding, or more for a world that does not step at every tick."""
     world = loop.environment.world
     return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
 
@@ -522,11 +531,11 @@ def _spare(loop: Loop) -> float:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
-    For Theorem 4 with constant delays and without a latency, V = T/(2 delta) (1 + ... + z^-theta), with T_max for T if
-    periods vary, requires the damping delta at every frequency. Let n = theta + 1. With the constant e n^2 T/(2 delta)
-    added, V requires delta/(1 + e) where the sum is largest, and less elsewhere. The zeros of the sum lie on the unit
-    circle, so without e the force against an object at rest rings without decay. A world that does not step at every
-    tick is at rest between its steps, so e is larger for such a world.
+    For Theorem 4 with constant delays and without a latency, V = T/(2 delta) (1 + ... + z^-theta) requires the damping
+    delta at every frequency. If periods vary, T is T_max here. Let n = theta + 1. If the constant e n^2 T/(2 delta) is
+    added to V, the required damping is delta/(1 + e) where the sum is largest, and less elsewhere. The zeros of the sum
+    lie on the unit circle, so that without e the force against an object at rest would ring without decay. A world that
+    does not step at every tick is at rest between its steps, so that e is larger for such a world.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -550,8 +559,8 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
 def _stiffest_in_frame(loop: Loop) -> Design:
     """Return the stiffest linear coupling of a loop with a latency or switching delays, for any environment.
 
-    The coupling follows from the least admissible He[V/(1-z)], chi (docs/theory.md), which has finitely many
-    coefficients. V(1)/2 is the mean of chi, and the multiplier minimises this mean.
+    `_from_chi` computes the coupling from chi, the least admissible He[V/(1-z)] (docs/theory.md). chi has finitely many
+    coefficients. Its mean is V(1)/2, and the condition's multiplier minimises this mean.
     """
     if loop.latency and loop.varying_delay:
         line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
@@ -559,21 +568,23 @@ def _stiffest_in_frame(loop: Loop) -> Design:
     chi = _late_chi if loop.latency else _switched_chi
     each = [chi(loop, i, delta) for i, delta in enumerate((1.0,) * loop.channels if loop.levels else loop.delta)]
     V = Lti.diag(*(_from_chi(terms, 2 * RESERVE * terms[0], loop.T) for terms in each))
-    if loop.levels:  # chi of a device is that of one N s/m times Delta_i^-1
+    if loop.levels:  # The chi of a device with the damping Delta_i is chi for 1 N s/m times Delta_i^-1.
         V = _rounded_inverse(loop.Delta()) @ V
     coupling = Compliance(V)
     return _verified(ANY_ENVIRONMENT.required(loop, coupling), coupling, "stiffness", _stiffness(coupling))
 
 
 def _rounded_inverse(level: Array) -> Array:
+    """Return the symmetric inverse with entries rounded to _TAP_DIGITS digits."""
     inverse = np.linalg.inv(level)
     return np.array([_rounded(row, _TAP_DIGITS) for row in (inverse + inverse.T) / 2])
 
 
 def _late_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return the coefficients chi_k of l (Q d)^-1 l*/4, l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], for the best Q.
+    """Return the coefficients chi_k of chi = l (Q d)^-1 l*/4 for a loop with a latency, with the best Q.
 
-    Q is the multiplier of facts.Latency, and d is (1 - RESERVE) delta.
+    Q is the multiplier of design.facts.Latency, d is (1 - RESERVE) delta, and
+    l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta].
     """
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
@@ -586,10 +597,11 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return the coefficients chi_k of |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha) for switching delays.
+    """Return the coefficients chi_k of chi = |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha) for switching delays.
 
-    v is the mean of the windows 1 + .. + z^-n of the delays n = lo and n = hi, h = (hi - lo)/2, and
-    d = (1 - RESERVE) delta/T_max. A constant delay has no alpha.
+    The delay switches between lo and hi, and h = (hi - lo)/2. v is the mean of the two windows 1 + .. + z^-n with
+    n = lo and n = hi, d is (1 - RESERVE) delta/T_max, and alpha is the multiplier that minimises the mean of chi. For a
+    constant delay chi is |v|^2/(4 d).
     """
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
@@ -604,7 +616,10 @@ def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _best_latency_multiplier(loop: Loop, i: int, theta: int) -> Array:
-    """Return the Q (2, 2) [1/s] that minimises trace(Q^-1 M), where M holds the inner products of l in `_late_chi`."""
+    """Return the Q (2, 2) [1/s] of `_late_chi` that minimises trace(Q^-1 M), which is proportional to the mean of chi.
+
+    M (2, 2) contains the inner products of the two entries of l.
+    """
     hands, scale = Latency(), 1 / loop.T
     root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))
     one = loop.channel(i)
