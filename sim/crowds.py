@@ -1,7 +1,7 @@
 """Validate a loop with many random passive humans, by two engines, in batches that several processes may share.
 
 A set has one human for each device. The humans of set i depend on the scenario, the seed and the number of links, and
-not on other sets. The batches do not depend on the number of processes, so that the findings do not, either.
+not on other sets. The batches, and therefore the findings, do not depend on the number of processes.
 
 The first engine is the exact one, which simulates all sets. The second engine is MuJoCo or a user's own, and simulates
 all sets or a sample (`_witnessed`). MuJoCo's verdict comes from the map of its RK4 integrator over one period, the
@@ -226,7 +226,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
-    """Return the findings of one batch; `ticked` is called with the number of ticks in each block of a simulation."""
+    """Return the findings of one batch; `ticked` is called with the ticks of each block of the second engine."""
     simulation = validation.simulation
     if member := validation.environment(indices[0]):
         scenario = validation.scenario.replace(environment=member.network, ranges=None)

@@ -376,7 +376,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lever(self) -> float:
-        """The radius [m] at which a hand holds a rotary device. It converts N to N m, and rad to m; otherwise 1."""
+        """The radius [m] at which a hand holds a rotary device, which converts N to N m; 1 for other devices."""
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:

@@ -461,7 +461,7 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class _LateBalance(Balance):
-    """The energies of a tick in which forces latch later; `damping` is delta/(T - latency), for the part after it."""
+    """The energies of a tick with a later latch; `damping` is delta/(T - latency), for the part after the latch."""
 
     before: Array  # (m, 1) [N/m] delta/latency for the part before the latch; 0 if a force latches at the tick
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)

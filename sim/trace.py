@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the forces' strongest frequency [Hz], from 10 Hz, in the last quarter; None if it is short or calm."""
+        """Return the forces' strongest frequency [Hz], from 10 Hz, in the last quarter; None for a short or calm trace."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -238,7 +238,7 @@ def slowest_seen(duration: float) -> float:
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Return the strongest oscillation of positions x (ticks, m, nsim) [m]; one that lasts exceeds `threshold` [m]."""
+    """Return the strongest oscillation of positions x (ticks, m, nsim) [m]; lasting ones exceed `threshold` [m]."""
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
