@@ -45,7 +45,7 @@ class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
     given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
-    port_least_J: float  # least energy at any tick that had entered: sum of f'(u[k] - u[k-1]), contact positions u
+    port_least_J: float  # least energy that had entered by any tick: sum of f'(u[k] - u[k-1]), contact positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # bound on the energy that constraints created (the lemma on MuJoCo worlds in docs/theory.md)
     unsettled_steps: int  # number of steps whose limited forces did not settle in the allowed repetitions

@@ -281,11 +281,11 @@ class Grip:
 
     @property
     def pull(self) -> Array:
-        """The force [N] on each axis of the hand on a handle that rests at 0."""
+        """The hand's force [N] on each axis, for a handle that rests at 0."""
         return _STIFFNESS * np.array(self.target)
 
     def force(self, scene: Scene, s: Array) -> Array:
-        """Return the force [N] on each axis of the hand on the handle, in the plant state s."""
+        """Return the hand's force [N] on each axis of the handle, in the plant state s."""
         joints, n = np.array(scene.handles)[list(self.channels)], scene.model.nq
         return self.pull - _STIFFNESS * s[joints] - _DAMPING * s[n + joints]
 
