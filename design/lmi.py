@@ -163,7 +163,7 @@ def lemma2(G: Ports, Q: Array, Y: Array, Sigma: Array | None, Phi: Array) -> Arr
     return _symmetric(rows)
 
 
-def lemma3(A: Array, B: Array, C: Array, D: Array, X: Array, U: Array, mu2: Array) -> Array:
+def lemma3(A: Array, B: Array, C: Array, D: Array, X: Array, U: Array, mu2: float) -> Array:
     """Return the matrix of Lemma 3 and (24) with mu2 = mu^2.
 
     It is positive definite for some U > 0 and X = U^-1 if and only if ||G||_inf < mu.
