@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the forces' strongest frequency [Hz] from 10 Hz, in the last quarter; None for calm forces."""
+        """Return the forces' strongest frequency [Hz] from 10 Hz in the last quarter; None for too few or calm ones."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
