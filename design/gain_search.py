@@ -319,7 +319,6 @@ class SwitchingLoop(SampledLoop):
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
-    _first = 0.5  # value of alpha T/delta at the start, if the search of SWITCHING finds no alpha
 
     def __init__(self, loop: Loop) -> None:
         self.active = np.flatnonzero(np.subtract(loop.delays.hi, loop.delays.lo))
@@ -328,9 +327,9 @@ class SwitchingLoop(SampledLoop):
         super().__init__(loop)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """Return x of the gains and of their best multiplier alpha."""
+        """Return x of the gains and of their best multiplier, or alpha T/delta = 0.5 if no multiplier is found."""
         multiplier = SWITCHING.required(self.loop, coupling).multiplier
-        alpha = np.array(self.loop.per_channel(multiplier)) if multiplier else self._first * self.unit
+        alpha = np.array(self.loop.per_channel(multiplier)) if multiplier else 0.5 * self.unit
         a = (alpha / self.unit)[self.active]
         return np.concatenate([super().point(coupling), np.clip(np.log(np.maximum(a, 1e-300)), *self.bounds)])
 
@@ -353,7 +352,6 @@ class LimiterLoop(SampledLoop):
     """The loop with limited forces: x = (log K, B/delta, c), where c (m,) is the multiplier of `LIMITER`."""
 
     bounds = (0.0, 5.0)
-    _first = 0.5  # value of c at the start
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)
@@ -361,7 +359,7 @@ class LimiterLoop(SampledLoop):
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
+        return np.append(super().point(coupling), np.full(self.loop.channels, 0.5))
 
     def judged(self, x: Array) -> Requirement:
         return LIMITER.required(self.loop, self.coupling(x), self.mu(x)[0][self.lead])
@@ -386,7 +384,6 @@ class KnownDeviceLoop(SampledLoop):
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # value of beta/(largest beta) at the start; the least mismatch hardly depends on it
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE
@@ -395,7 +392,8 @@ class KnownDeviceLoop(SampledLoop):
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        return np.append(super().point(coupling), np.full(self.active.size, np.log(self._first)))
+        # The least mismatch hardly depends on the start, beta = 0.35 (largest beta).
+        return np.append(super().point(coupling), np.full(self.active.size, np.log(0.35)))
 
     def beta(self, x: Array) -> Array:
         """Return beta (m,) [s] at x."""

@@ -84,22 +84,18 @@ class Optimal(Design):
         return self.certificate is not None
 
 
-_Progress = Callable[[str, int, int], None]  # called with (task, number of finished bases, number of all bases)
-
-
-def _silent(task: str, finished: int, bases: int) -> None:
-    """Report no progress."""
+_Progress = Callable[[str, int, int], None] | None  # called with (task, number of finished bases, number of bases)
 
 
 def design_with(
-    loop: Loop, condition: str = THIS_ENVIRONMENT.name, progress: _Progress = _silent, **options: Any
+    loop: Loop, condition: str = THIS_ENVIRONMENT.name, progress: _Progress = None, **options: Any
 ) -> Optimal:
     """Return the optimal coupling under `condition` for Options(**options). `progress` is called before each task."""
     made = _for_known_devices if condition == KNOWN_DEVICE.name else design
     return made(loop, program.Options(**options), progress)
 
 
-def design(loop: Loop, options: program.Options = program.DEFAULT, progress: _Progress = _silent) -> Optimal:
+def design(loop: Loop, options: program.Options = program.DEFAULT, progress: _Progress = None) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
     With ranges around the environment, a proved coupling satisfies this-environment at every vertex (at 128 vertices
@@ -270,7 +266,8 @@ class _Search:
     def say(self, task: str) -> None:
         """Report the progress before a task."""
         last = f" (last filter: {self.results[-1].mismatch_db:z.2f} dB)" if self.results else ""
-        self.progress(f"{task}{last}", len(self.results), len(self.options.bases))
+        if self.progress:
+            self.progress(f"{task}{last}", len(self.results), len(self.options.bases))
 
     def result(self, taps: int, poles: int, candidate: Optimal) -> _BasisResult:
         """Return the result of the basis with this best coupling."""
@@ -306,7 +303,8 @@ class _Search:
             beta, c = beta_of(self.loop, before.certificate), before.certificate.multipliers["c"]
             condition = LimitedForces(beta, len(c) // len(self.loop.devices))
             return (program.Slip(beta, condition.rows(self.loop, c)),)
-        return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
+        tried = _LAGS if any(self.loop.psi) else _LAGS[:1]
+        return tuple(program.Slip(beta, ((c,),) * len(self.loop.devices)) for beta, c in tried)
 
     def cases_with(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
         """Return the environments with their constraints, including the limiter's block for `slip`."""

@@ -164,10 +164,6 @@ class Slip:
     def condition(self) -> LimitedForces:
         return LimitedForces(self.beta, len(self.c[0]))
 
-    @classmethod
-    def even(cls, loop: Loop, beta: float, c: float) -> Slip:
-        return cls(beta, ((c,),) * len(loop.devices))
-
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
     """Return LimitedForces as a constraint, which leaves the share MARGIN of the damping and 2 % of rho unused."""
