@@ -122,15 +122,18 @@ class ConeProgram:
             Infeasible: Two settings report that there is no solution.
             DesignFailed: No setting gives a result that can be verified.
         """
-        attempts: list[_Attempt] = []
+        attempts, infeasible = list[_Attempt](), False
         for name in settings or ((INTERIOR,) if any(block.large for block in self.blocks) else SETTINGS):
             x, attempt = self._attempt(name, accept)
             if attempt.reason is None:
                 return x
             attempts.append(attempt)
-            statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
-            if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
-                raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
+            infeasible = sum(each.status == "PrimalInfeasible" for each in attempts) >= 2
+            if infeasible:
+                break
+        statuses = ", ".join(f"{each.settings}: {each.status}" for each in attempts)
+        if infeasible:
+            raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
         advice = "try shorter delays, a larger damping or a lower order; the error's `problem` is the convex problem"
         raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 

@@ -406,6 +406,7 @@ class _Search:
         coupling, needs = self.kept_in_all(problem)
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
+        tried = list[Optimal]()
         for share in _RESERVES:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
@@ -414,10 +415,10 @@ class _Search:
                 return replace(candidate, reason=_SETTLED)
             if not self.options.limiter:
                 return candidate
-            candidate = self._proved(candidate, slip)
-            if candidate.proved:
+            tried.append(self._proved(candidate, slip))
+            if tried[-1].proved:
                 break
-        return candidate
+        return tried[-1]
 
     def proved_or_smaller(self, candidate: Optimal) -> Optimal:
         """Return the coupling with its proof, after scaling the forces down if necessary, or without a proof."""
@@ -503,11 +504,12 @@ class _Search:
 
     def first_proved(self, candidates: Iterable[Optimal], slip: program.Slip | None = None) -> Optimal:
         """Return the first candidate that is proved, or the last one with the reason why its proof failed."""
+        tried = list[Optimal]()
         for candidate in candidates:
-            result = self._proved(candidate, slip)
-            if result.proved:
+            tried.append(self._proved(candidate, slip))
+            if tried[-1].proved:
                 break
-        return result
+        return tried[-1]
 
     def spring_damper(self) -> Optimal | None:
         """Return the best spring-damper. With ranges, a latency or further constraints the result is None."""
