@@ -6,7 +6,7 @@ refined sweep finds the worst violation is added, until the gains pass the sweep
 
 The block of a condition is affine in G = (I + Psi E V)^-1 Psi E and, for fixed G, in the multiplier. So its
 responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes. Only the block of
-known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew for each gains and multiplier.
+known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew at every step.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class SampledLoop:
     condition of this class is this-environment, which has no multiplier.
     """
 
-    #: indices of the channels (in KnownDeviceLoop: of the devices) with a multiplier. Each adds a row to the block.
+    #: indices of the channels with a multiplier, each of which adds a row to the block; in KnownDeviceLoop, devices
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
@@ -117,6 +117,7 @@ class SampledLoop:
         return x[: 2 * self.loop.channels]
 
     def point(self, coupling: SpringDamper) -> Array:
+        """Return the x at which a search starts with these gains."""
         return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
 
     def judged(self, x: Array) -> Requirement:

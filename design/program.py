@@ -325,7 +325,7 @@ def _zeros(E: Lti) -> Complex:
 
 
 def _separate(modes: Complex) -> list[complex]:
-    """Return the modes without those that are too close to an earlier one: 5 % of its distance to the unit circle."""
+    """Return the modes that are not too close to an earlier mode (5 % of that mode's distance to the unit circle)."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
@@ -384,9 +384,9 @@ class Problem:
     def objective(self) -> tuple[Array, Array, Array]:
         """Return A, b, c of |A x - b|^2 + c'x, a sum of mismatch, soft rows, lost static stiffness and size of R.
 
-        The mismatch is its square if the objective is the rms, or the own unknown r of `worst_mismatch`. Each channel's
-        row of R is a separate least-squares problem, which is reduced to its triangular factor. The problems share only
-        g, so that A has hardly more rows than unknowns.
+        The mismatch is the squared rms mismatch, or the unknown r of `worst_mismatch` for the objective "sup". Each
+        channel's row of R is a separate least-squares problem, which is reduced to its triangular factor. The problems
+        share only g, so that A has hardly more rows than unknowns.
         """
         parts = self._weighed()
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
@@ -407,7 +407,7 @@ class Problem:
         return np.vstack([*rows, of_g]), np.concatenate([*right, [held, 0.0]]), cost
 
     def _weighed(self) -> list[tuple[Array, Complex, Complex]]:
-        """Return terms (w, L, target L) of the objective sum |F L - target L|^2 over the frequencies w.
+        """Return terms (w, L, target L) of the objective, the sum of |F L - target L|^2 over the frequencies w.
 
         L contains weight/|E|, and for the mismatch also `_evened`. The target of the mismatch is Lambda E, and that of
         soft rows is zero.
