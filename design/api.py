@@ -42,7 +42,7 @@ class DesignOptions(TypedDict, total=False):
 
     order: int  # ccl: states per channel
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
-    limiter: bool  # cover limited forces, too; the default tries this only for a spring-damper by this-environment
+    limiter: bool  # cover limited forces, too; by default tried only for a spring-damper with this-environment
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
     band_hz: tuple[float, float]  # [Hz] optimal, spring-damper of least mismatch: band of the mismatch
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None for a soft penalty
@@ -77,14 +77,14 @@ def design_coupling(
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
-    named(condition or usual_condition(loop, kind))  # raises ValueError for an unknown or taken name
+    named(condition or usual_condition(loop, kind))  # raises ValueError for an unknown or reserved name
     known(options, KINDS[kind].options, f"kind {kind!r}")
     design = design_by_kind(loop, kind, condition, **options)
     return replace(design, certified_for=certified_for(loop, design.requirement.certified))
 
 
 def certified_for(loop: Loop, certified: bool) -> Network | None:
-    """Return the loop's environment if it is certified and the linear network of a MuJoCo scene, else None."""
+    """Return the loop's environment if `certified` and if it is the linear network of a MuJoCo scene, else None."""
     network = loop.environment
     return network if certified and isinstance(network, Network) and network.linear_model_of else None
 
@@ -126,9 +126,9 @@ def instead(
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
-    Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or the own
-    condition of a Design, is judged with the loop's ranges and switching. With loop.varying_delay the further entry
-    "switching" is for delays that switch in any way within loop.varying_delay.
+    Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or your own
+    condition for which a Design was made, is judged with the loop's ranges and switching delays. With a varying_delay
+    of the loop, the entry "switching" is for delays that switch in any way within it.
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
@@ -137,8 +137,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
-        the frequency [Hz] at which it binds, and `proof`: "rational" for exact arithmetic, "sampled" for a refined
-        sweep. A condition that no damping satisfies has an infinite `required` and a `reason`.
+        the binding frequency [Hz], and `proof`: "rational" for exact arithmetic, "sampled" for a refined sweep. A
+        condition that no damping satisfies has an infinite `required` and a `reason`.
 
     Raises:
         TypeError: An argument has the wrong type.

@@ -64,7 +64,7 @@ from haptic_loop.design.transparency import BAND_HZ, Transparency, in_band, sile
 from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
 #: A user's function from displacements (m,) [m] of the environment to forces (m,) [N] at a tick. The displacements are
-#: those that the tick would have without force.
+#: those that the environment would have at this tick if its forces were zero.
 PluggedEnvironment = Callable[[Array], Array]
 
 
@@ -234,7 +234,7 @@ class ForceLimits:
         force_limit: (m,) largest forces [N] for reports, or (); `Assessment.within` sets them.
         less: Whether the limiter is covered in one environment only, while the guarantee covers more environments.
         bounded: Whether the limiter is covered only for devices within the bounds of the condition known-device.
-        energy_budget: The start W0 [J] of an energy account of the forces; None without one.
+        energy_budget: The initial energy W0 [J] in an energy account of the forces; None without an account.
         void: Whether the loop that runs has no guarantee; a proof of the limiter then does not apply.
         proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
     """
@@ -392,7 +392,7 @@ class EncoderSteps:
         friction_max: Sequence[float | None] | None = None,
         beyond: str | None = None,
     ) -> EncoderSteps | None:
-        """Compare the declared friction (m,) [N] with the need of encoder steps (m,) [m]; return None without steps.
+        """Compare the declared friction (m,) [N] with what encoder steps (m,) [m] require; return None without steps.
 
         `beyond` is the name of the condition that certifies the loop if this condition covers no encoder steps.
         """
@@ -430,11 +430,11 @@ class Guarantee:
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers. For an energy account it is "no passive hand", which begins `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
-        forces: Whether limited forces are covered, or what scales the forces; the words follow the word "forces".
+        forces: Words that follow "forces": whether limited forces are covered, or what scales the forces.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
-        energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
-            releases; None for a guarantee that the loop comes to rest.
+        energy_J: Bound of the energy [J] that a hand receives, after subtraction of what the devices dissipate and what
+            a MuJoCo scene releases; None for a guarantee that the loop comes to rest.
         vertices: Words for the proved vertices of "these ranges": "every vertex", or "128 of 625 vertices".
         own: Name and file of the user's own condition that gives the guarantee, in words, or None.
         positions: The restriction by encoder steps in words that follow the environments (EncoderSteps.suffix), or "".
@@ -632,8 +632,9 @@ def assess(
             in this loop, other multipliers are searched.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
-        energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
-            world. Without a shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
+        energy_budget: Initial energy W0 [J] of the shell's account; the default is 0 for a function and 2 mJ for a
+            MuJoCo world. Without a shell, W0 of an energy budget at the devices (controller.budget); the default is no
+            budget.
         certificate: A stored proof, which is ignored unless it is for exactly this loop and coupling and holds. The
             proof is verified unless this process has made or verified it.
         condition: The name of the condition that must hold, or a user's own condition. The default is this-environment,

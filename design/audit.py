@@ -77,7 +77,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 _STIFFEST, _LONGEST_PERIOD, _MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the edge between certified and uncertified values
-_SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; larger ones may be a jump.
+_SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; else ratio may jump there.
 
 
 @dataclass(frozen=True)

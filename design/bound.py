@@ -61,7 +61,7 @@ _FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objecti
 _GAP = 0.004  # The barrier method ends at this gap to the optimum, relative to the bound on J.
 _LEAST = 1e-9  # A smaller bound on J is useless.
 _WANTED = 1e-3  # wanted error of the lower bounds of D between frequencies, relative to the bound on J
-_QUADRATURE = 1e-8  # It is always subtracted from the bound on J, because the estimate's rule has no error bound.
+_QUADRATURE = 1e-8  # subtracted from every bound and estimate of J, because the estimate's rule has no error bound
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # Gauss's rule in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53  # unit roundoff of double precision
@@ -475,7 +475,7 @@ class BoundBeside:
         options: Options,
         begun: Forked[Bound] | None = None,
     ) -> BoundBeside:
-        """Return the bound for the loop of a design with the rms mismatch `reached_db`; `begun` computes `bound`."""
+        """Return the bound for the loop of a design with the rms mismatch `reached_db`; `begun` runs `bound`."""
         if loop.channels > MOST:
             return cls(reason=_NO_BOUND)
         if best.condition == "known-device":

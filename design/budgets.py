@@ -71,10 +71,10 @@ FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
 #: and multipliers (4 cuts and 11 rounds for the pair of omega.3 with known transmissions).
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Numbers of points that a search between the vertices of ranges tries. RANGE_EDGES is that for all edges together, and
-#: RANGE_ALONG has the least and the largest number for one edge. From six parameters on, the least number for each edge
-#: gives more than RANGE_EDGES in total. RANGE_DRAWN points lie on faces and inside. RANGE_STARTS compass searches
-#: follow. For up to five parameters this takes the 500 sweeps of RANGES.
+#: Numbers of points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, and at least
+#: RANGE_ALONG[0] and at most RANGE_ALONG[1] on each edge. From six parameters on, the least number for each edge gives
+#: more than RANGE_EDGES in total. RANGE_DRAWN points lie on faces and inside. RANGE_STARTS compass searches follow. For
+#: up to five parameters this takes the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge. Brackets hold the largest number that was measured in the optimal and the default

@@ -313,7 +313,8 @@ def condition_of(certificate: Certificate, condition: Condition | None = None) -
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(
-            f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected c to have equally many per rho"
+            f"multipliers: rho has {len(rho)} numbers and c has {len(c)}, "
+            f"expected 1 to {len(certificate.available)} in rho and a multiple of that in c"
         )
     limiter = replace(own or LIMITER, lags=len(c) // len(rho), held=rho)
     if isinstance(base, LimitedKnownDevice):
@@ -449,7 +450,7 @@ def is_ours(condition: Condition) -> bool:
 
 
 def named(condition: str | Condition) -> Condition:
-    """Return the condition with this name, or the condition itself. Raises ValueError for an unknown or taken name."""
+    """Return the named condition, or the condition itself. Raises ValueError for an unknown or reserved name."""
     if not isinstance(condition, str):
         of_kind("condition", condition, Condition, f"{', '.join(_NAMED)} or your own Condition")
         name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
@@ -470,8 +471,8 @@ def required_damping(
 ) -> Requirement:
     """Return the requirement of a condition, by a refined sweep.
 
-    If `multiplier` is None, the condition chooses the multiplier. With ranges, a condition on the environment returns
-    the largest requirement of all members. The requirement of a singular loop is infinite.
+    If `multiplier` is None, the condition chooses the multiplier. With ranges, a condition that uses the environment
+    returns the largest requirement of all members. The requirement of a singular loop is infinite.
     """
     return named(condition).judge(loop, coupling, multiplier)
 

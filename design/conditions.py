@@ -3,8 +3,9 @@
 A condition is a block that must be strictly positive real: stable, with the Hermitian part He[block] > 0 on |z| = 1.
 `Demand` (design.facts) holds the block as free + s gain, where s multiplies the damping Delta_D that the devices
 guarantee. Poles at z = 1 are split off by `over_z_minus_one`. The same expression serves sweeps in floating point,
-which give the required damping, and exact proofs over Fractions. Maps and designs evaluate it for many couplings at
-once, or for sampled responses. docs/theory.md derives the conditions. Numbers such as (12) are equations of the paper.
+which give the required damping, and exact proofs over Fractions. Z-width maps and designs evaluate it for many
+couplings at once, or for sampled responses. docs/theory.md derives the conditions. Numbers such as (12) are equations
+of the paper.
 
 design.facts describes the two parts of a condition, the hands' side and the facts of the environment's side, and has
 base classes for new ones. design.environments and design.known_device search for multipliers. design.certificate proves
@@ -385,7 +386,7 @@ class Condition(ABC):
 def _least_damping(
     name: str, system: Lti, demand: Callable[[], Demand[Lti]], available: tuple[float, ...]
 ) -> Requirement:
-    """Return the damping that a demand requires, of `available` [N s/m]; `system` has the block's poles."""
+    """Return the damping that a demand requires. `system` has its block's poles, and `available` is in N s/m."""
     if reason := unsound(system, available):
         return refusal(name, available, reason)
     try:

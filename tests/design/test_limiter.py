@@ -246,9 +246,9 @@ def tampered(stored, **fields):
     [
         ({"c": (0.5, 0.5)}, "limiter: required is"),
         ({"c": (1.0, 1.0)}, "limiter: no proof was found"),
-        ({"c": (0.3, 0.1, 0.6)}, "expected c to have equally many per rho"),
+        ({"c": (0.3, 0.1, 0.6)}, "expected 1 to 2 in rho and a multiple of that in c"),
         ({"c": (-0.1, 0.7)}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
-        ({"c": (0.3,)}, "expected c to have equally many per rho"),
+        ({"c": (0.3,)}, "rho has 2 numbers and c has 1"),
         ({"rho": (20.0, 20.0)}, "required is"),
         ({"rho": (-1.0, 10.0)}, "rho is"),
         ({"facts": ()}, "multipliers are"),
