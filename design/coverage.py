@@ -109,9 +109,9 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of `design` over the ranges, after those of the design that `nominal` makes without ranges.
+    """Return figures over the ranges: first of the design that `nominal` makes without ranges, then of `design`.
 
-    The latter are left out if `nominal` is None or its design fails.
+    The first are left out if `nominal` is None or its design fails.
     """
     couplings = {kind: design.coupling}
     if nominal:
@@ -131,7 +131,7 @@ _PERCENT = 10.0  # change of a parameter in reports
 
 @dataclass(frozen=True)
 class Robustness:
-    """The worst requirement of a coupling in the nominal environment and with one parameter changed by `percent`."""
+    """The worst requirement of a coupling in the nominal environment and the similar environments of `_nearby`."""
 
     percent: float
     required_over_available: float  # required over available damping in the worst environment
@@ -172,8 +172,9 @@ def _nearby(network: Network) -> dict[str, Network]:
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return the worst requirement of `condition` in the environment and near it, or None if this does not apply.
 
-    It applies to a network without walls and without a block E(z), whose values may be increased by ten percent. The
-    condition must cover the loop. It must neither hold in every environment nor have a reason `not_varied`.
+    The environment must be a network without walls and without a block E(z), and allow an increase of each value by
+    _PERCENT. The condition must cover the loop. It must neither hold in every environment nor have a reason
+    `not_varied`.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None

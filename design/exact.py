@@ -82,7 +82,7 @@ def negative_minor(S: Any) -> str | None:
 
     The elimination S = LDL' is exact. A pivot has the sign of the principal minor of its row and of the rows before it
     that were not skipped. If a pivot is zero, S is semidefinite only if the pivot's entire row in the Schur complement
-    is zero; the row is then skipped. Otherwise any other entry of this row makes a principal minor negative.
+    is zero; the row is then skipped. Otherwise each nonzero entry of this row makes a principal minor negative.
     """
     work, used = fractions(S).copy(), list[int]()  # `used` are the rows of positive pivots, counted from 1.
     for k in range(len(work)):

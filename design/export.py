@@ -78,7 +78,7 @@ class ExportedBlock:
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
     limiter: Limiter | None = None  # None without one; otherwise `system` is the block while no force is limited
-    single: tuple[float, float] | None = None  # None: double precision; else (largest error, largest output) of single
+    single: tuple[float, float] | None = None  # (largest error, largest output) of single precision; None for double
 
     @property
     def dtype(self) -> type[np.floating]:
@@ -240,7 +240,7 @@ def _in_order(terms: Any) -> Any:
 
 
 def _solved(rows: Array, pivoting: bool) -> Array:
-    """Solve A x = b (n,) for the rows [A b] (n, n + 1), which are changed, as the C file does."""
+    """Solve A x = b (n,) for the rows [A b] (n, n + 1) by the operations of the C file; `rows` are overwritten."""
     n, x = len(rows), rows[:, -1].copy()
     for k in range(n):
         if pivoting:
@@ -325,7 +325,7 @@ def _block_of_balls(
     n, real = len(q), q.dtype.type
     residual, rounding, eye = real(_RESIDUAL), real(_ball_rounding(real)), np.eye(n, dtype=real)
     u = back = q
-    length, tried, best = np.empty_like(q), False, real(0)  # whether u is Newton's step, and the residual before it
+    length, tried, best = np.empty_like(q), False, real(0)  # `tried`: u is a Newton step; `best`: the residual before
     for _ in range(_MOST_STEPS):
         for own in vectors:
             length[own] = np.sqrt(_in_order(u[own] * u[own]))

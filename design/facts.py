@@ -99,7 +99,7 @@ class Input:
 
     name: str
     channel: int
-    moved: _Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
+    moved: _Weights = (1,)  # f[k] multiplies the sum of (w_0 + w_1 z + ..) times the input over a channel's inputs
     follows: int = 1  # 1 for a displacement, to which the environment responds; 0 for a speed
     slips: bool = True  # whether the limiter's slip, if there is one, is subtracted from the input
 
@@ -142,7 +142,7 @@ class Collected(Generic[Block]):
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Add the quadratic form of the hands' side. Its displacements still contain the slip."""
+        """Add the quadratic form of the hands' side, where each displacement is the sum of its input and its slip."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -316,8 +316,8 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 class Unknowns:
     """The numbers of one multiplier.
 
-    A search keeps each number between `least` and `most` times its unit. For the hands' side, s times the number is
-    kept there.
+    A search keeps each number between `least` and `most` times its unit. For a multiplier of the hands' side, it keeps
+    s times the number in this range.
     """
 
     name: str  # name of the multiplier in files

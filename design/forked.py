@@ -68,7 +68,7 @@ class Forked(Generic[_Result]):
             os.dup2(writer, 3)
             for opened in os.listdir("/proc/self/fd"):
                 if int(opened) > 3:
-                    with suppress(OSError):  # the folder's own number
+                    with suppress(OSError):  # the descriptor of listdir, which is closed
                         os.close(int(opened))
             for stream in range(3):
                 os.dup2(os.open(os.devnull, os.O_RDWR), stream)

@@ -341,7 +341,7 @@ class Sweep:
         return self.form(self.maps[environment], named, KnownMotor(PeriodCost(*np.zeros((4, len(beta)))), beta))
 
     def floor(self, beta: Array) -> float:
-        """Return the least share for which beta is allowed, that is at most _LARGEST_ETA `largest_beta`, or inf."""
+        """Return the least share at which beta is at most _LARGEST_ETA times `largest_beta`, or inf if none is."""
         if not ((beta > 0) & (beta <= _LARGEST_ETA * self.highest)).all():
             return np.inf
         return float((beta**2 * self.P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2

@@ -71,7 +71,7 @@ class Requirement:
         reason: Why `required` is infinite.
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
         multiplier: The multiplier with which `required` was computed, or None.
-        bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None. For a
+        bound: A lower bound of `ratio` for every allowed multiplier, from the frequencies of the search, or None. For a
             limiter, `Demand.spare` is first subtracted from the block, and `bound` is at most `ratio`.
         guarantee: The environments for which the condition holds, in words.
         limiter_rho: (m,) stiffnesses rho [N/m] of a limiter that the condition covers without further proof, or None.

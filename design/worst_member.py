@@ -159,7 +159,7 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Return a local maximum and its value, by compass search from `point`.
 
-    Each step moves along the best axis. If no move gives a larger value, the step is halved.
+    Each move is along the best axis. If no move gives a larger value, the step length is halved.
     """
     # With many parameters only some vertices were tried. So the first steps move one parameter to an end of its range.
     step = 1.0 if point.size > _MANY else _FIRST
