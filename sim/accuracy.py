@@ -91,7 +91,7 @@ class Row:
     integrator: str | None
     substeps: int | None
     position_relative_rms: float | None  # rms error of positions over the rms of the exact positions
-    growth_rate_error: float  # [1/s] of two errors, with and without the coupling, the one of larger magnitude
+    growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling, with its sign
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of one channel's force in the limit cycle without coupling
     cycle_frequency_hz: float | None  # frequency of the same force
@@ -382,8 +382,8 @@ def compare_engines(
     Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
     constant delays without the layer. Every run calls `progress`.
 
-    Raises InputError if `error` is not positive or if nothing moves. With friction it is also raised if the error would
-    need more than 256 substeps or 60 million evaluations of the dynamics.
+    Raises InputError if `error` is not positive or if nothing moves. With friction it is also raised if RK4 with 128
+    substeps misses `error`, or if the runs would need more than 60 million evaluations of the dynamics.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -570,7 +570,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return least_substeps(EXPONENTIAL)
-    if integrator == "discrete":  # It has more states than the positions and velocities of `_agrees`.
+    if integrator == "discrete":  # It has states that the map of `_agrees` lacks.
         raise InputError(f"--integrator discrete gives no reliable verdict: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T

@@ -78,7 +78,7 @@ class HeldDevices:
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Return two growth rates (n,) [1/s] of the loop of F with every human: of the dominant mode and fast mode.
+        """Return the growth rates (n,) [1/s] of the dominant mode and of the dominant fast mode, with every human.
 
         A fast mode has at least `min_frequency_hz`. Where the mask `humans` (n,) is False, the growth is -inf.
         """
@@ -200,7 +200,7 @@ class Points:
         return [str(word) for word in words]
 
 
-#: flat indices of cells -> stack of their linear force maps, and the computer's process of each cell
+#: flat indices of cells -> stack of their linear force maps, and the controller's process of each cell
 _Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 
 

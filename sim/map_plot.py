@@ -1,4 +1,4 @@
-"""The picture of a Z-width map: edges of certificates, cells that random humans decide, and simulated points."""
+"""The picture of a Z-width map: edges of certified regions, verdicts with random humans, and simulated cells."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _edges(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
-        # On the edge, required over available damping is 1 - GUARD. Larger ratios are cut so that they are finite.
+        # The edge is the contour 1 - GUARD of required over available damping. Clipping makes infinite ratios finite.
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:

@@ -131,7 +131,7 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
     needs = requirements[ANY_ENVIRONMENT.name]
     if not needs.ratio <= 1 - EPS:
         return None
-    return f"it never acts from rest: the certificate for any environment leaves {100 * EPS:g} % of the damping or more"
+    return f"it never acts from rest: any-environment requires at most {100 * (1 - EPS):g} % of the devices' damping"
 
 
 class _Budgeted:

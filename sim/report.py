@@ -52,7 +52,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
     ]
 
 
-#: The transparency indices (equation 25) [dB] that the paper prints. No tried reading of its Figure 4 reproduces them.
+#: Transparency indices (equation 25) [dB] that the paper prints. None of our readings of its Figure 4 gives them.
 _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
@@ -121,7 +121,7 @@ class DelaySpan:
     hi: tuple[int, ...]
     pattern: str
     loss: float  # probability that a packet is lost
-    playout: bool  # whether a buffer in the device makes the delay hi
+    playout: bool  # whether a buffer in the device keeps the delay constant at hi
     constant: bool  # whether the delay is theta at every tick
 
     @classmethod
@@ -339,7 +339,7 @@ class RunReport:
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            # Any other reason explains the index tau, which only the JSON has.
+            # With a nonzero mismatch the reason is about the index tau, which only the JSON has.
             "transparency": transparency and transparency.relative_mismatch == 0 and transparency.reason,
             "credible": self.credible.reason,
             **{name: part.reason for name, part in certificates.items()},

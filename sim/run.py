@@ -82,7 +82,7 @@ class Simulation:
     process: Process
     scene: Scene
     plant: HeldPlant  # the plant over a period T; forces latch in the middle of their range of latencies
-    timing: Timing | None = None  # begin and latch times of ticks; None without `period` and `latency` in the scenario
+    timing: Timing | None = None  # times of ticks and latches; None without `period` and `latency` in the scenario
 
     @cached_property
     def loop(self) -> Loop:
@@ -282,8 +282,8 @@ def run_blocks(
 ) -> None:
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), block by block.
 
-    `each_block` is called after each block, and returns True to stop. Row 0 of the buffer is then the block's first
-    tick. A block of 32 ticks fits into the processor's cache. Raises InputError for an engine without `advance`.
+    `each_block` is called after each block, and returns True to stop. In this call row 0 of the buffer is the block's
+    first tick. A block of 32 ticks fits into the processor's cache. Raises InputError for an engine without `advance`.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
@@ -367,7 +367,7 @@ def make_engine(
     substeps: int | None = None,
     T: float | None = None,
 ) -> Engine:
-    """Return an engine for one simulation: a named one, a user's engine, or that which a class or function makes.
+    """Return an engine for one simulation: a named one, a user's engine, or the result of a class or function.
 
     `integrator` and `substeps` are MuJoCo's (default: `default_integrator`, `least_substeps`). A tick of MuJoCo lasts T
     [s] (default: as in the scenario). Raises ValueError for an unknown name, an object that is no engine, the exact

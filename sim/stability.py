@@ -432,7 +432,7 @@ class ImpulseTest:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """The energies of a tick in which forces latch at its begin: the work of the forces and the least dissipation."""
+    """The energies of a tick at whose beginning forces latch: the work of the forces and the least dissipation."""
 
     damping: Array  # (m, 1) [N/m] delta/T
     Delta: Array | None  # (m, m) [N s/m] with the diagonal delta; None if no device has a damping matrix
@@ -475,7 +475,10 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces (ticks, outside) [N] for 10 ms or a longer tick: `size` on channel 1, -size/2 on 2, and so on."""
+    """Return the external forces (ticks, outside) [N] of an impulse at tick 0, in the ticks from `first` on.
+
+    For 10 ms, or for one longer tick, `size` pushes channel 1, -size/2 channel 2, size/3 channel 3, and so on.
+    """
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

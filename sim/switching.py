@@ -8,8 +8,8 @@ the forces g_i that G sent in the last d_i ticks, where d_i is the largest delay
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
 [lo, hi] allow several forces; each device receives that force which gives it the most power -f v. An age grows by
 at most one per tick, because a device holds its newest force. Candidates for the worst period are windows of this
-sequence that may be repeated, and constant delays at the ends of their ranges. Of all candidates, the product of mode
-matrices of the worst one grows fastest per tick. A spectral radius of this product above 1 proves instability.
+sequence that may be repeated, and constant delays at the ends of their ranges. The worst candidate is the one whose
+product of mode matrices grows fastest per tick. A spectral radius of this product above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -261,9 +261,9 @@ class DelaysCovered:
     """Whether a certificate covers the delays of a scenario, and the damping that switching requires."""
 
     covered: bool
-    covers: str  # words on the delays that are covered, or that no delays are covered
+    covers: str  # which delays are covered, and by which proof, in words
     switching: SwitchingFigures | None = off_table(default=None)
-    on_file: DelayRange | None = None  # delays for which the coupling's file proves any switching, if it covers these
+    on_file: DelayRange | None = None  # range that the coupling's file proves, if it contains the scenario's
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:
@@ -288,12 +288,12 @@ class DelaysCovered:
             cover = "any switching of the delays within their range"
             words = f"certified for switching delays in this environment ({proof}): {cover} is covered"
             if stated is None:
-                words = f"not covered: {assessment.reason}; otherwise {cover} would be ({proof})"
+                words = f"not covered: {assessment.reason}; otherwise {cover} would be covered ({proof})"
             return cls(stated is not None, words, figures, on_file)
         buffered = figures.playout is not None and figures.playout.certified
         verdict = "for which the coupling is certified" if buffered else "which no certificate covers either"
-        constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
-        advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
+        of = " of received packets" if lossy else ""
+        advice = f"a playout buffer (--playout) makes the delay{of} the constant {list(varying.hi)}, {verdict}"
         words = f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}"
         return cls(False, words, figures, on_file)
 

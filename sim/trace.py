@@ -110,7 +110,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached its limit (m,) [N]; in a ball the length of the force vector counts."""
+        """Return (N,) whether a force reached its limit (m,) [N]; in each of `balls`, whether its vector did."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the forces' strongest frequency [Hz] from 10 Hz in the last quarter; None for too few or calm ones."""
+        """Return the strongest frequency [Hz] from 10 Hz in the forces' last quarter; None if it is short or calm."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -233,7 +233,7 @@ class Oscillation:
 
 
 def slowest_seen(duration: float) -> float:
-    """Return the lowest frequency [Hz] that `oscillation` sees in a trace of `duration` seconds."""
+    """Return the lowest frequency [Hz] that `oscillation` sees in the second half of a trace of `duration` seconds."""
     return 4 * _PERIODS / duration
 
 

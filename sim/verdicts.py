@@ -30,7 +30,7 @@ class Unstable:
     exact: int
     mujoco: int | None
     own: int | None = off_table("if given", None)  # number by a user's own engine
-    others: str = off_table("left out", "")  # number and name of the second engine, in words
+    others: str = off_table("left out", "")  # number by the second engine, with its name, as "3 MuJoCo"
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:

@@ -225,7 +225,7 @@ class Touched:
 
 
 def live(simulation: Simulation) -> Simulation:
-    """Return the simulation with a passivity layer for its world that also delays forces; runs may have any length."""
+    """Return the simulation with a passivity layer that contains its world and delays the forces by theta."""
     touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:

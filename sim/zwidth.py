@@ -108,7 +108,7 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """For each condition its multiplier (m,) for all couplings, or None; and why it does not apply, or None."""
+        """For each condition its multiplier (m,) or None, and None or the reason why the condition does not apply."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
@@ -137,7 +137,7 @@ class CouplingSweep(_Sweep):
             each = [None] * self.loop.channels if multiplier_of is None else [(p,) for p in multiplier_of.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
-        elif self.walls and judge.guarantee(self.loop) != ANY:  # Then each coupling needs multipliers of its own.
+        elif self.walls and judge.guarantee(self.loop) != ANY:  # Each coupling needs its own multipliers here.
             return self._one_by_one(condition, K, B)
         shares = [judge.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
         known = [ratios for ratios in shares if ratios is not None]
@@ -193,7 +193,7 @@ class EnvironmentSweep(_Sweep):
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """Return F in every environment as one stack. A coupling with a model has that of the cell's environment."""
+        """Return a stack with F of every environment. An optimal coupling holds a model of the cell's environment."""
         return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array) -> list[Process]:

@@ -155,7 +155,7 @@ class _Simulated:
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The report of a map. Rows are stiffnesses. Null means infinite, not applicable, or not computed."""
+    """The report of a map. An array's rows are stiffnesses. Null means infinite, not applicable, or not computed."""
 
     rigid: bool
     scenario: str | None

@@ -78,7 +78,7 @@ class DrawnObject:
     def of(cls, network: Network) -> DrawnObject:
         """Return the network with contacts beside their devices, and other points in columns behind them.
 
-        The column of a point is its least number of springs or walls to a contact.
+        A point's column is the least number of springs and walls between the point and a contact.
         """
         points = tuple(network.points) or tuple(network.nodes())
         nodes = set(network.contacts)
@@ -201,7 +201,7 @@ def scene_xml(simulation: Simulation) -> str:
 
 
 def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
-    """Add the geoms of a MuJoCo scene in its initial pose left of the devices, without meshes, fields, soft bodies."""
+    """Add the geoms of a MuJoCo scene in its initial pose, left of the devices, without meshes and height fields."""
     import mujoco
 
     with quiet_warnings():

@@ -99,7 +99,7 @@ def _places(scene: Scene) -> tuple[int, ...]:
 
 
 def _scale(history: Array, limit: Array) -> float:
-    """Return a power of two [N] above every force and above 1 N, or above 1/16 of the largest limit if it is less."""
+    """Return a power of two [N] above every force and above the lesser of 1 N and 1/16 of the largest limit."""
     least = min(1.0, float(np.max(limit)) / 16)
     return float(2.0 ** np.ceil(np.log2(max(least, 1.05 * np.abs(history).max(initial=0.0)))))
 
