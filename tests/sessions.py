@@ -41,7 +41,7 @@ def in_fork(call, *arguments):
     """Call in a fork of this process, which changes no object here. Return the result, or raise the exception."""
     read, write = os.pipe()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forks in programs with threads: the fork needs none
+        warnings.simplefilter("ignore", DeprecationWarning)  # warns of forks beside threads; this fork uses none
         child = os.fork()
     if not child:
         try:

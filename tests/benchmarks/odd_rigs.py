@@ -19,7 +19,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
-#: rig -> error of its bound by a fit of one mass with Coulomb friction; that fit refused the other rigs
+#: rig -> error of the bound that an earlier fit gave, of one mass with Coulomb friction; it refused the other rigs
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")

@@ -59,7 +59,7 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 
 def devices() -> None:
     """Measure, in the order of the columns: a run of 2 s, an audit by both conditions with exact proofs, a design for
-    clipped forces, one with a limiter, the proof for its limited forces, and a design for any-environment.
+    clipped forces, a design with a limiter, the proof of this limiter, and a design for any-environment.
     """
     for n in (2, 4, 8, 16, 32):
         scenario = parse(star(n))

@@ -255,7 +255,7 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
     """Return a case of any-environment: a limiter with rho = 0, and walls with dampers that make and break contact.
 
-    Among eight random loops it takes the one whose own environment needs the largest share of that damping.
+    Of eight random loops it takes the one whose own environment needs the largest share of any-environment's damping.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:

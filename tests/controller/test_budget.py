@@ -161,7 +161,7 @@ def test_the_budget_holds_on_stiffer_springs():
     ],
 )
 def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, report):
-    """The budget learns at once, four ticks late, or never which forces acted."""
+    """The budget learns which forces acted: at once, four ticks late, or never."""
     rng, nsim = np.random.default_rng(8), 90
     hands = Hands(rng, nsim, True, 0.01)
     W0, initial, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4

@@ -195,7 +195,7 @@ def test_one_simulation_ticks_like_several(channels, weakest):
 
 @pytest.mark.parametrize(("walls", "limited"), checkered((0, 1, 2), (True, False)))
 def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
-    """Walls and springs differ between the laws, states press into the walls, and forces exceed their limits."""
+    """Walls and springs differ between the laws, the states begin inside the walls, and forces exceed their limits."""
     laws = []
     for k in range(6):
         some = tuple(Wall(w.between, w.stiffness * (1 + k), 2.0 + k, w.gap / (1 + k)) for w in WALLED.walls[:walls])

@@ -99,7 +99,7 @@ def test_the_quotient_at_one_equals_its_definition(blocks):
 
 
 def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
-    """Without its pole at z = 1, G/(z-1) keeps He. In Fractions, 3 + 1/z has G(1) = 4 and leaves -2 - 1/z."""
+    """G/(z-1) without its pole at z = 1 has the same Hermitian part. G = 3 + 1/z gives G(1) = 4 and leaves -2 - 1/z."""
     G = blocks[0] + (blocks[0].dc().T - blocks[0].dc()) / 2
     at_one, regular = G.over_z_minus_one()
     whole, rest = G.at(Z) / (Z - 1)[:, None, None], regular.at(Z)
@@ -131,7 +131,7 @@ def test_output_delays_equal_powers_of_z(blocks):
             block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D
         )
         assert block.poles().size == block.order
-    assert loop._lines[0].size == G.order + 5 + 1  # of the output's 3 delays, 2 only copy the first
+    assert loop._lines[0].size == G.order + 5 + 1  # 5 input delays; of the output's 3 delays, 2 only copy the first
 
 
 def _stiff():

@@ -197,7 +197,7 @@ class Gel:
 
 
 def test_maxwell_elements_are_passive_despite_rounding():
-    """A spring and a damper in series have E(1) = 0, the difference of two numbers k b/T/(k + b/T)."""
+    """A spring and a damper in series have E(1) = 0; in floats it is a difference of two numbers near k b/(k T + b)."""
     rng, below = np.random.default_rng(0), 0
 
     def maxwell(k: float, b: float, period: float, less: float = 0.0) -> Lti:

@@ -198,7 +198,7 @@ def test_limited_forces_are_not_searched_between_vertices():
 
 
 def test_one_environment_covers_no_ranges():
-    """Of 1.37 N s/m the nominal mass of 1 kg needs the share 0.9713 and 0.1 kg needs 0.9735. The device has 0.973."""
+    """In units of 1.37 N s/m the device has 0.973; the nominal mass of 1 kg needs 0.9713, and 0.1 kg needs 0.9735."""
     loop = change(LOOP, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.973 * 1.37,))
     nominal = assess(loop, HERE_ONLY, ranges_samples=0, limiter=False)
     assert (nominal.ranges.proved, nominal.holds) == (False, False)

@@ -167,7 +167,7 @@ def test_any_environment_takes_matrix_levels() -> None:
 
 def test_latency_takes_matrix_levels() -> None:
     late = msgspec.structs.replace(LOOP, latency=((1e-4, 3e-4),) * 2 + ((2e-4, 2e-4),) * 2)
-    # With q12 = 0, device 1 needs q11 < 1/t2 and q22 < 1/(T - t1). For a constant latency, as of device 2, all are 0.
+    # q11, q12, q22 by device: q12 = 0 needs q11 < 1/t2 and q22 < 1/(T - t1); a constant latency (device 2) has zeros.
     apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)
     assert required_damping(late, BUILT, "this-environment", apart).ratio == pytest.approx(0.619369, abs=5e-7)
     assert required_damping(late, BUILT, "this-environment").ratio < 0.619369
@@ -415,8 +415,8 @@ ONE_KNOWN = msgspec.structs.replace(ONE_DEVICE, known_devices=(BOUNDS,) * 2)
 def period_forms(loop: Loop, share: float, beta: np.ndarray) -> np.ndarray:
     """Return L of Theorem B with full levels, on (dx, v, v+) (3m, 3m).
 
-    L is the least integral of v^T C0 v + c2 |dv/dt|^2 over a period. C0 = share Delta_i - beta^2 P/4 I; SciPy computes
-    K = (C0/c2)^(1/2) and tanh(K T/2).
+    L is the least integral of v^T C0 v + c2 |dv/dt|^2 over a period. C0 = share Delta_i - (beta^2 P_t/4) I; c2 and P_t
+    are those of docs/theory.md. SciPy computes K = (C0/c2)^(1/2) and tanh(K T/2).
     """
     m, P = loop.channels, BOUNDS.transmission_stiffness_max**2 / BOUNDS.transmission_damping_min
     out, one = np.zeros((3 * m, 3 * m)), np.eye(2)

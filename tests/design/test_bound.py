@@ -229,7 +229,7 @@ def test_no_bound_exceeds_a_late_loops_mismatch():
 
 
 def test_splines_and_dilogarithm_equal_those_of_scipy():
-    """The bounds are 1e-14 for sums of products below 1, and the dilogarithm's error of 300 roundings."""
+    """The tolerances are 1e-14 for sums of products below 1, and 300 roundings for the dilogarithm."""
     knots, x = np.array([0.0, 0.3, 1.0, 1.1, 2.0]), np.linspace(0, 2, 41)
     every = np.concatenate([[0.0] * 3, knots, [2.0] * 3])
     expected = scipy.interpolate.BSpline.design_matrix(x, every, 3).toarray()

@@ -149,7 +149,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     ("loop", "order"), [pytest.param(pair(), 1, marks=pytest.mark.validate), (LONE, 3)], ids=["pair", "one"]
 )
 def test_three_steps_beat_the_structured_design(loop, order):
-    """The start leaves a share `_START_ROOM` of the damping unused. Three steps lower the norm by over ten times it."""
+    """The start leaves a share `_START_ROOM` of the damping unused. Three steps lower the norm by ten such shares."""
     structured, design = spring_damper.design(loop), ccl.design(loop, order, most_sdps=3)
     assert design.sdps == structured.sdps + 3  # no step ended in the solver's rounding
     assert design.objective < structured.objective * (1 - 10 * _START_ROOM)

@@ -167,7 +167,7 @@ def test_environment_delay_needs_more_damping_for_any_environment():
 
 @pytest.mark.validate
 def test_proof_and_sweep_agree_on_both_sides():
-    """A random loop is proved if and only if its ratio is below 1, but from 1 - 1e-4 to 1 it need not be proved."""
+    """A random loop is proved if its ratio is below 1 - 1e-4, and refused if its ratio is above 1."""
     rng = np.random.default_rng(7)
     outcomes = []
     for _ in range(60):

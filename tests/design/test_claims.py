@@ -54,9 +54,9 @@ def needed(e_hat_inverse, K, B, theta):
 
 
 def test_theorem_1_telescopes():
-    """With y = D (G + Theta-hat) g, g y - delta y^2 is the device's balance plus (g[k]^2 - g[k-n]^2)/(4 delta).
+    """g y - delta y^2 is g[k-n] dx/T - delta (dx/T)^2 + (g[k]^2 - g[k-n]^2)/(4 delta) and has no negative sum.
 
-    The sums of g y - delta y^2 over time are not negative.
+    Here y = dx/T + (g[k] - g[k-n])/(2 delta), n = theta + 1, and the held force g[k-n] moves the device by dx.
     """
     rng = np.random.default_rng(0)
     for theta in range(4):
@@ -427,7 +427,7 @@ def test_delayed_spring_that_uses_all_damping_is_refused(unused):
 
 
 def test_no_convex_step_increases_the_norm():
-    """The tangent lies below g*g, so on fixed frequencies no step increases the norm of the step before."""
+    """The tangent lies below the convex term that it replaces, so at fixed frequencies no step increases the norm."""
     shaping = Shaping(Loop(T, THETA, (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4))
     w = np.concatenate([np.geomspace(1e-3, 3, 20), [0.0465]])  # 0.0465: the resonance at 6.17 Hz
     gains = np.array([0.1, 0.1, 0.4, 0.4])

@@ -58,7 +58,7 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_damping_within_bounds(k, damping, theta, latency, most):
-    """The requirement is at least 4 % below `most`, for which m = 0 and the parts of a period are bounded separately.
+    """The requirement is at least 4 % below `most`, which bounds each part of a period alone and has m = 0 for walls.
 
     A wall that never loses contact needs no more.
     """

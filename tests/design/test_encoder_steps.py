@@ -147,7 +147,7 @@ def _first_line(command, scenario, options, tmp_path, capsys):
 
 
 def stated(covered):
-    """Return a record of which a command must state the words if friction covers the encoder steps, or does not."""
+    """Return a record with the words that commands must print if friction covers the encoder steps, or if not."""
     return EncoderSteps((STEP,), (0.0,), (None,), None, covered, "")
 
 

@@ -200,7 +200,7 @@ def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_discretised_costs_lie_just_above_the_least(seed):
-    """With v in 600 linear pieces the least cost is larger than with any v, but by less than 1e-4."""
+    """The least cost over v in 600 linear pieces exceeds that over all v, by less than 1e-4 of it."""
     rng = np.random.default_rng(seed)
     T, beta = 1e-3, 5e-5 * rng.uniform(0.1, 0.9)
     loop = one(T, 1.3)

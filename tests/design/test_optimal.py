@@ -215,7 +215,7 @@ def test_progress_names_each_part_of_the_work():
     [
         # a negligible g may fall further
         ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),
-        ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # under half of another basis's g is rejected
+        ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # a basis with under half of another's g is rejected
         ([(0.8, 0.5), (0.7, 0.6), (0.699, 0.6), (0.6, 0.6), (0.58, 0.6), (0.578, 0.6)], 4),
     ],
 )
@@ -803,7 +803,7 @@ def test_late_walls_match_their_closed_form():
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n2", "n4"))]
 )
 def test_limiter_designs_satisfy_the_limiters_block(name):
-    """With D = Delta/T, He[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] > 0 on a grid."""
+    """On a grid (j) of docs/theory.md is positive. Here N and M are its N_c and M_c, and D is Delta/T."""
     loop = loop_of(name)
     optimum, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
     assert optimum.proved

@@ -95,7 +95,7 @@ def test_files_name_the_bounds_of_own_known_devices():
 @pytest.mark.slow
 @pytest.mark.parametrize(("shipped", "fact"), checkered((KNOWN_DEVICE, KNOWN_DEVICE_ANY), FACTS))
 def test_known_devices_keep_an_own_fact(shipped, fact):
-    """At constant speed L <= s delta dx^2/T, which bounds the damping from below; beta -> 0 bounds it from above."""
+    """At constant speed Theorem B's L <= s delta dx^2/T bounds s from below; beta -> 0 bounds it from above."""
     own = condition(type(shipped), fact)
     needs, plain = required_damping(KNOWN, SOFT, own), required_damping(KNOWN, SOFT, shipped.plain)
     assert fact.less * KNOWN.T <= needs.required[0] * (1 + 1e-9)

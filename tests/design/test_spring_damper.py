@@ -90,7 +90,7 @@ def test_no_certified_gains_do_better(case, draws):
 
 
 def test_designs_solve_at_most_four_convex_problems():
-    """The design solves at most four problems. tests/benchmarks/test_design_cost.py measures the seconds."""
+    """tests/benchmarks/test_design_cost.py measures the seconds."""
     assert design(pair()).sdps <= 4
 
 
@@ -333,7 +333,7 @@ def test_designs_that_take_minutes_are_refused_early():
 
 @pytest.mark.slow
 def test_one_start_comes_close_to_all_starts(monkeypatch):
-    """Above FEW channels the search has one start. The gains have five digits, which change the objective by 4e-6."""
+    """Above FEW channels the search has one start. Rounding gains to five digits changes the objective by 4e-6."""
     usual = design(pair(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)
     monkeypatch.setattr(gain_search, "FEW", 1)

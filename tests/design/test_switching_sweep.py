@@ -129,7 +129,7 @@ def test_the_energy_bound_holds_for_worst_ages():
     spent = (dx**2 * (needed / T)[:, None]).sum(axis=1)
     spare = (np.cumsum(stored + spent, axis=0) / np.cumsum(spent, axis=0))[10:]
     assert spare.min() > 0
-    assert spare.min() < 0.6  # One motion uses over two fifths of the damping, here 0.85.
+    assert spare.min() < 0.6  # One motion uses over two fifths of the damping: 0.85 of it when measured.
 
 
 def test_unsafe_or_malformed_switching_is_refused():

@@ -309,7 +309,7 @@ def test_uncovered_wall_couplings_are_refused():
 
 
 def test_couplings_may_be_stiffer_than_any_environment_allows():
-    """At a wall of 3000 N/m a coupling of 1300 N/m is proved, and any-environment needs over 1.2 of the damping."""
+    """At a wall of 3000 N/m a coupling of 1300 N/m is proved; any-environment needs over 1.2 times the damping."""
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, gap=0.005),)))
     coupling = SpringDamper([1300.0], [0.45])
     assert any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).ratio > 1.2

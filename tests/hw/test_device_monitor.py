@@ -446,7 +446,7 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
 
 
 def test_lost_states_are_no_lost_answers(scenario):
-    """A twentieth of the STATEs is lost, and so are the answers to them; ages that they report are lost, too."""
+    """A twentieth of the STATEs is lost. Nobody answers them, and the ages that they report are lost, too."""
     session, _, exact = measured(scenario, (FaultInjection.parse("up:drop=0.05"),), 1000)
     ages = session.measurement.result
     assert exact is not None  # the second round

@@ -218,7 +218,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     constant = certified_coupling(judged.replace(latency=((130e-6, 130e-6),) * 2), "I", None, None, 0, given)
     latest, ranged = (
         max(one.assessment.requirements["this-environment"].required) for one in (constant, host)
-    )  # a range needs at least what its latest end needs, and less than forces 0.13 ms late in periods of 1.33 ms
+    )  # the range needs at least as much as its largest latency, and less than 0.13 ms in periods of 1.33 ms
     assert latest - 1e-6 <= ranged < 0.637433
     assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 

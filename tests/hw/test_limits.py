@@ -36,7 +36,7 @@ INFO = Info(PROTOCOL, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400
 
 @given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))
 def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
-    """Python's max and min turn nan into the cap; shape never does."""
+    """Python's max and min turn nan into the cap; `SafetyLimits.shape` never does."""
     before = tuple(
         max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
     )

@@ -52,7 +52,7 @@ from tests.checks.faults import (
 def test_deaf_devices_do_not_finish_sessions(harmless):
     """The host cannot remove the force of a device that ignores it, but says so, and the session has not finished.
 
-    A rehearsal waits for this: a device must be at rest 30 ms after STOP.
+    The session checks 30 ms after STOP whether the device is at rest, and the rehearsal lasts until then.
     """
 
     def logged(case):

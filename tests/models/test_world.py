@@ -246,7 +246,7 @@ def test_friction_loss_takes_more_than_it_creates(tmp_path):
 
 @pytest.mark.parametrize("scene", SCENES[:5])
 def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
-    """A one-sided row that presses has f = -D ((w+ - w)/h + b w+ + K (r + h w+)), which is <= 0 for the others.
+    """A one-sided row that presses has f = -D ((w+ - w)/h + b w+ + K (r + h w+)); for other rows this is <= 0.
 
     No row is in a friction cone.
     """

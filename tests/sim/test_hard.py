@@ -64,7 +64,7 @@ def quiet(loop):
 
 
 def test_encoder_steps_move_traces_less_than_a_step():
-    """With encoder steps, motions stay within a step of those with ideal encoders, and idle devices within one."""
+    """With encoder steps, motion is within a step of that with ideal encoders, and idle devices within a step of 0."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (run(assemble(s, PUBLISHED["I"]), "exact") for s in (scenario, coarse))

@@ -27,7 +27,7 @@ NO_SCENARIOS = {
     "a name without end": TEXT.replace('"omega-pair"', f'"{1000 * "n"}"'),
     "a huge name": LATE.replace('"omega-pair"', f'"{1_000_000 * "n"}"'),
 }  # fmt: skip
-#: parts of the scenario, each with a field whose number (the last one) is replaced by one of NUMBERS
+#: parts of the scenario; one of NUMBERS replaces the last number in the part
 FIELDS = """stiffness = 800.0 | damping = 1.0 }, | masses = { mass = 1.0 } | motor_mass = 0.06 | handle_mass = 0.19
     transmission_stiffness = 14500 | force_limit = 12.0 | duration = 15.0 | mass = 0.3 | stiffness = 200.0
     amplitude = 0.015 | frequency = 0.6 | ease = 1.0 | force = 1.0 | start = 0.1 | theta = [1, 2] | psi = [0, 0]
