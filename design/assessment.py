@@ -59,6 +59,7 @@ from haptic_loop.design.result import (
     NotProved,
     Requirement,
     held_torques,
+    listed,
 )
 from haptic_loop.design.transparency import BAND_HZ, Transparency, in_band, silent, transparency
 from haptic_loop.design.worst_member import Progress, Searched, search_ranges
@@ -340,7 +341,7 @@ def _by_its_own_block(
         requirement = required_damping(loop, coupling, limiter)
     rows = _rows(limiter, loop, requirement)
     if not requirement.certified:
-        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
+        needs = f"limiter: a proof for limited forces needs {listed(requirement.required, 5)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, rows)
     rho = loop.per_channel(plain.rho(loop))
     covered = ForceLimits(rho, _OWN_PROOF, requirement, rows, bounded=limiter is not plain)

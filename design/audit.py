@@ -298,7 +298,7 @@ def _helps(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirem
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> Help | None:
-    """Return the least reduction of the delays `name`, one for all channels, that certifies, or else the best one."""
+    """Return the least reduction, the same for all channels, of the delays `name` that certifies, or else the best."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)

@@ -342,7 +342,7 @@ class Condition(ABC):
         return named_values
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the multiplier for all couplings or None, the reason why the loop is not covered or None)."""
+        """Return (the multiplier that serves every coupling or None, why the loop is not covered or None)."""
         return None, self.beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:

@@ -148,7 +148,7 @@ def _limited_block(
     about = (
         f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N while positions and states are "
-        "finite: the contact slips instead. NaN and infinity stay in the state until the reset.",
+        "finite: the virtual contact slips instead. NaN and infinity stay in the state until the reset.",
         delays,
     )
     return ExportedBlock("process", limiter.open, _DISPLACEMENT, _FORCE, about, limiter)

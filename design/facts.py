@@ -119,7 +119,7 @@ class Collected(Generic[Block]):
         self.path, self.hands = path, hands
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
         self._into: list[tuple[int, int, _Weights]] = []  # (output of `_filter`, input, weights)
-        self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to the response
+        self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to f_e
         self._sums: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of f_e)
         self._steps: list[tuple[int, int, _Weights]] = []  # (row, channel, weights of the steps of f_e)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, True for y and False for its steps)

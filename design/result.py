@@ -238,7 +238,7 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class Design(Chosen):
-    """A coupling with its objective, and the requirement that was computed from the coupling alone.
+    """A coupling with the value of its objective and the damping that it requires.
 
     Attributes, beside those of Chosen:
         figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
