@@ -9,7 +9,7 @@ certify(loop, coupling)             Return a Requirement per condition: the damp
 assess(loop, coupling)              Return an Assessment: requirements, force limits, and the guarantee or a reason.
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
 simulate(scenario, coupling)        Return a Trace: a run with the humans of the scenario, tick by tick.
-validate(scenario, coupling)        Return Findings: the growth of the loop with many random humans.
+validate(scenario, coupling)        Return Findings: the loop's growth rates with many random humans.
 linearise(world, pose)              Return a Network, the linear model of a MuJoCo scene near a pose.
 rehearse(scenario)                  Return a Rehearsed: a session with an emulated device, in virtual time.
 trace.plot(path), trace.to_frame()  Draw a Trace; return it as a pandas data frame.
