@@ -61,13 +61,13 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
     """The fields and properties that both kinds of devices have."""
 
     damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
-    force_limit: _PerAxis = 12.0  # [N] CHAI3D's number for omega.3; one number limits the vector, a list each axis
+    force_limit: _PerAxis = 12.0  # [N] CHAI3D's number for omega.3; one number for the vector, a list for single axes
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping, such as an identified bound; None means `damping`
     credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
-    # In a study, teleoperation masters moved faster than 0.7 m/s in a fifth of the fast part of a tapping task.
+    # In a study, the masters of teleoperators moved faster than 0.7 m/s for a fifth of the fast phase of tapping.
     guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use; refused for a rigid device
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
@@ -122,7 +122,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
 class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
     """A motor with encoder, joined to the handle by a transmission spring.
 
-    `damping` is the output-strict-passivity level of the port at motor and encoder, for every load at the transmission.
+    `damping` is the output-strict-passivity level at motor and encoder, for every passive load on the transmission.
     """
 
     motor_mass: float = 0.06  # [kg] assumed; motor and handle have 0.25 kg together
@@ -217,7 +217,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def of(self, device: Device) -> Device:
         """Return the device with these mechanics. Raises ValueError for a rigid device, or mechanics out of bounds."""
         if isinstance(device, RigidDevice):
-            raise ValueError("a rigid device has no transmission that could be drawn")
+            raise ValueError("kind is 'rigid', expected 'compliant': these mechanics include a transmission")
         return msgspec.structs.replace(device, **msgspec.structs.asdict(self))
 
 
@@ -242,7 +242,7 @@ def _each(self: Any, name: str) -> tuple[float, ...]:
     if not isinstance(value, tuple):
         return (value,)
     if len(value) != self.axes or self.axes == 1:
-        expected = "one number" if self.axes == 1 else f"one number or {self.axes}"
+        expected = "one number" if self.axes == 1 else f"one number or {self.axes} numbers"
         raise ValueError(f"{name} is {list(value)}, expected {expected}: the device has axes = {self.axes}")
     return value
 
@@ -263,7 +263,7 @@ def _check_axes(self: Any) -> None:
 
 
 def _check_damping(self: Any) -> None:
-    """Raise ValueError unless 0 < delta <= damping. Several axes have matrices; one axis may have the damping 0."""
+    """Raise ValueError unless 0 < delta <= damping (matrices if axes > 1). A single damping may be 0 without delta."""
     if self.axes == 1:
         for name in ("damping", "delta"):
             if isinstance(getattr(self, name), tuple):

@@ -120,9 +120,9 @@ def expm_each(matrices: _Array) -> _Array:
 def _units(A: _Array, h: float) -> _Array:
     """Return units (nsim, states) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    In a plant without impedances the second half of the states are velocities. The unit of a velocity is close to the
-    frequency of the fastest mode. The norm of h A for a stiff plant is then about this frequency times h, and the
-    exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
+    Without impedances the second half of the states are velocities, whose unit is close to the frequency of the fastest
+    mode. The norm of h A for a stiff plant is then about this frequency times h, and the exponential has a rounding
+    error of 1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact, also with impedances.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))

@@ -101,7 +101,7 @@ class Port:
 
     Raises:
         ValueError: A shape does not match, a parameter is negative, a point other than a handle has no mass, `pull` is
-            no spring-damper, or a port with several handles has an impedance.
+            not the index of a spring-damper, or a port with several handles has an impedance.
     """
 
     mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
@@ -129,7 +129,7 @@ class Port:
             raise ValueError("port: expected one or more handles, and a positive mass at every other point")
         groups = len(self.across) // self.axes
         if not self.across[:, : -self.axes].any(axis=1).all() or not -groups <= self.pull < groups:
-            raise ValueError("port: expected spring-dampers with at least one point, and the index of one as `pull`")
+            raise ValueError("port: expected at least one point per spring-damper, and a spring-damper index as `pull`")
         if self.impedance and (self.handles > 1 or self.impedance.A.shape[:-2] != tuple(many)):
             raise ValueError("port: an impedance is for ports with one handle, and has the leading axes of `mass`")
 
@@ -137,7 +137,7 @@ class Port:
     def chain(cls, links: _Array, axes: int = 1) -> Self:
         """Return a chain from the handle to the base.
 
-        A link of `links` (..., n, 1 + 2 axes^2) has a mass, then dampings and stiffnesses along each of `directions`.
+        A link of `links` (..., n, 1 + 2 axes^2) has a mass, then all dampings, then all stiffnesses along `directions`.
         The springs along the axes come last in a link, so that the voluntary force contracts those of the last link.
         """
         n, count = links.shape[-2], axes**2

@@ -55,8 +55,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 
 _Array = NDArray[np.floating[Any]]
 
-#: In MuJoCo a device creeps although friction holds it. With 0.25 kg, 0.3 N of friction and a push of 0.15 N it creeps
-#: at 1e-7 m/s with these parameters, and at 6e-4 m/s with the defaults of MuJoCo.
+#: solref and solimp of the motors' friction. In MuJoCo a device creeps although friction holds it: 0.25 kg with 0.3 N
+#: of friction and a push of 0.15 N creep at 1e-7 m/s with these numbers, and at 6e-4 m/s with the defaults of MuJoCo.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies
@@ -123,8 +123,8 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
     """Build one scene of devices, each held by its human. `persons` hold several devices.
 
     Raises:
-        ValueError: There are more or fewer humans than devices, a human has other axes than the device, or a person
-            holds a device that does not exist or that another person holds.
+        ValueError: There are more or fewer humans than devices, a human has other axes than the device or several
+            handles, or a person holds a device that does not exist, is held by another person, or has other axes.
     """
     held = tuple((person.holds, person.port()) for person in persons)
     return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
@@ -325,7 +325,8 @@ def _placed(
 ) -> tuple[_Placed, ...]:
     """Return the placed ports of all devices, then those of `held`.
 
-    Raises ValueError if the numbers or axes of humans and devices differ, or if a person holds an impossible device.
+    Raises ValueError if the numbers or axes of humans and devices differ, if a human has several handles, or if a
+    person holds a device that does not exist, is held by another person, or has other axes.
     """
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
@@ -624,9 +625,8 @@ class Crowd:
     links: _Array  # (nsim, devices, links, 3 or more): mass [kg], dampings [N s/m], stiffnesses [N/m]
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
-    # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    # (devices,) numbers of free axes, if a link has 1 + 2 max(axes)^2 numbers; () if it has three
-    axes: tuple[int, ...] = ()
+    # bodies: (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
+    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes, if a link has 1 + 2 max(axes)^2 numbers; else ()
     mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:
@@ -670,7 +670,7 @@ def _link(row: _Array, axes: int) -> Link:
     return Link(float(row[0]), tuple(map(tuple, damping)), tuple(map(tuple, stiffness)))
 
 
-MIXED = 0  # value of `links`: the humans of a set all have one link or all two, with equal probability
+MIXED = 0  # value of `links`: with equal probability every human of a set has one link, or every human has two
 
 
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
@@ -710,7 +710,7 @@ def crowds(
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
     `holds` lists the devices of each person who holds several, and `axes` the free axes of each device, as in Crowd.
-    `known` are the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
+    `known` are devices whose masses and transmissions are drawn within their guaranteed bounds, if all have bounds.
     """
     drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
@@ -806,8 +806,8 @@ class Variants:
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     """Return the models of the devices with every set of humans.
 
-    Raises ValueError if the numbers or axes of humans and devices differ, if a person holds an impossible device, or if
-    the humans of one device differ in their structure.
+    Raises ValueError if the numbers or axes of humans and devices differ, if a person holds a device that does not
+    exist, is held by another person or has other axes, or if the humans of one device differ in their structure.
     """
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array, block_diagonal
 from haptic_loop.models.scene import quiet_warnings
 
-_CONTACT_MASS = 0.03  # [kg] mass of a contact for which the scene states no mass; a density does not count
+_CONTACT_MASS = 0.03  # [kg] mass of a contact for which the scene states no mass; densities are ignored
 ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
 _MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
@@ -203,8 +203,8 @@ class World:
     def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> WorldPort:
         """Return a simulation of the scene from its initial pose, with force limits (m,) [N] at the contacts.
 
-        A limit bounds each component of a contact's force. If the contact's channels are one of the `balls`, the limit
-        bounds the length of the force.
+        A limit bounds each component of a contact's force. If `balls` contains the slice of the contact's channels, the
+        limit bounds the length of the force.
         """
         limits = np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float)
         return WorldPort(self, limits, balls)
@@ -560,7 +560,7 @@ class Rows:
 
     force: Array  # (rows,) [N]
     after: Array  # (rows,) w+, the speed after the step [m/s]; w is the speed before it
-    depth: Array  # (rows,) r, negative inside [m]
+    depth: Array  # (rows,) r, a signed distance, negative in penetration [m]
     D: Array  # (rows,) inverse regularisation of the row's law f = -D ((w+ - w)/h + b w+ + K (r + h w+)) [kg]
     K: Array  # (rows,) reference stiffness [1/s^2]
     b: Array  # (rows,) reference damping [1/s]
@@ -601,8 +601,8 @@ class Rows:
 
 
 _NONE = "no energy (lemma)"
-_BOUNDED = "lemma, up to what contacts create (printed by a run)"
-_ROW = "lemma with the row term: may create energy; the shell bounds it"
+_BOUNDED = "lemma: at most what contacts create, which a run prints; the shell bounds it"
+_ROW = "may create energy, at most the lemma's term; the shell bounds it"
 _SMALL = "small in measurements; the shell bounds it"
 _VARYING = "small in measurements unless contact is made fast; the shell bounds it"
 _TURNING = "small in measurements of slow motion; the shell bounds it"
@@ -633,7 +633,7 @@ def _parts(m: mujoco.MjModel, slides: set[int]) -> list[_Part]:
         _Part("bodies that translate", len(movable) - turning, _NONE),
         _Part("bodies that turn", turning, _TURNING),
         _Part("joint springs", int((m.jnt_stiffness[joints] != 0).sum()), _NONE),
-        _Part("springs and dampers of negative constants", sum(int((c < 0).sum()) for c in constants), _SHELL),
+        _Part("springs and dampers with negative constants", sum(int((c < 0).sum()) for c in constants), _SHELL),
         _Part("springs and dampers that are not linear", sum(int((c != 0).any(axis=1).sum()) for c in higher), _SHELL),
         _Part("springs that yield", yielding, _SHELL),
         _Part("tendons", m.ntendon, _SMALL),

@@ -473,7 +473,7 @@ def test_the_digest_covers_every_mesh_that_mujoco_reads(tmp_path):
 @pytest.mark.parametrize(
     ("joint", "more", "part"),
     [
-        ('damping="-5"', "", "springs and dampers of negative constants"),
+        ('damping="-5"', "", "springs and dampers with negative constants"),
         ('stiffness="10 -50"', "", "springs and dampers that are not linear"),
         ("", '<option wind="1 0 0" density="1.2"/>', "wind"),
         ("", "", None),
