@@ -291,7 +291,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
     """Return X with M X = right over the Fractions, by sparse elimination. Raises SingularLoop if M is singular.
 
     The next pivot is in the row with the fewest entries. In this row it is in the column with the fewest entries
-    (Markowitz). So few zeros become nonzero.
+    (Markowitz). This keeps most zeros.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]

@@ -203,8 +203,8 @@ class EnergyBudget(_Net):
 
         `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. Without
         `acted` that force is the one sent `lo` ticks earlier, if hi = lo and `hold` is 0; otherwise it is unknown. The
-        first call ignores both. `wanted` must be clipped to forces that the device can apply. An entry that is nan, or
-        has a size of 1e12 N or more, is sent as zero.
+        first call ignores `dx` and `acted`. `wanted` must be clipped to forces that the device can apply. An entry that
+        is nan, or has a size of 1e12 N or more, is sent as zero.
         """
         if self.ticks:
             self._book(self._turned(dx), None if acted is None else self._turned(acted))

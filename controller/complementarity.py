@@ -18,12 +18,12 @@ from haptic_loop.controller.lti import Array, ReadOnly, frozen
 _LEAST_MINOR = 1e-12  # a principal minor of at most this size, of a matrix with unit diagonal, counts as zero
 _MOST_CANDIDATES = 27  # largest number of active sets to enumerate (three channels, or two with a wall)
 GROUNDED = 1e-10  # regularisation of a singular matrix, and of a block of force vectors, relative to its diagonal
-PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of its difference
+PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the sum of its terms' sizes
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem(ReadOnly):
-    """A complementarity problem of a tick. M maps wall forces p to displacements, or slips v to changes of forces."""
+    """A problem of a tick. M maps wall forces to displacements, or slips at force limits to changes of the forces."""
 
     M: Array  # (n, n)
 

@@ -320,7 +320,7 @@ class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
 
     file: str  # MJCF
     digest: str  # SHA-256 over the names and contents of the scene's files
-    along: tuple[tuple[tuple[float, float, float], ...], ...]  # directions per touched body, one per contact
+    along: tuple[tuple[tuple[float, float, float], ...], ...]  # (bodies, axes, 3) directions of the contacts
     every: int = 1  # number of ticks for one step of the scene
 
     def __post_init__(self) -> None:
@@ -529,7 +529,7 @@ def environment(network: Network, T: Number) -> Lti:
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. The states are q- and v-, the previous displacements of contacts with dampers or masses, and the
     previous velocities of contacts with masses. The network's block is added to E(z). The arithmetic is that of T.
-    Raises ValueError if an internal node has no mass and is held by nothing, or only by the rounding of directions.
+    Raises ValueError if nothing holds an internal node without mass, or if only rounding of directions holds a node.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
     key = parts, type(T), T  # the type of T decides the arithmetic
@@ -612,7 +612,7 @@ _SLACK = 1e-9  # smaller eigenvalues, relative to the largest one, come from the
 
 
 def _check_directions(lengths: Sequence[Sequence[tuple[str, float]]], inner: dict[str, int], free: int) -> None:
-    """Raise ValueError if more directions than the exact number `free` are free within rounding."""
+    """Raise ValueError if more directions are free within rounding than the `free` ones of exact arithmetic."""
     rows = np.zeros((len(lengths), len(inner)))
     for row, ends in zip(rows, lengths, strict=True):
         for node, sign in ends:

@@ -233,7 +233,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all channels of a ball
-    rho: Array  # (m,) [N/m] resists changes of the slip: 0 for any environment with psi = 0, else a share of delta/T
+    rho: Array  # (m,) [N/m] resists changes of slip: 0 if proved for any environment (psi = 0), else a share of delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     def __post_init__(self) -> None:

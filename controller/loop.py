@@ -104,7 +104,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
     axes: tuple[int, ...] | None = None  # number of channels of each device; None: one for each device
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], with diagonals as in delta; None: diag(delta)
-    unit: PositionUnit = "m"  # unit of positions; with "rad" N m, N m s/rad and kg m2 replace N, N s/m and kg
+    unit: PositionUnit = "m"  # unit of positions; if it is "rad", N m, N m s/rad and kg m2 replace N, N s/m and kg
 
     def __post_init__(self) -> None:
         if not 0 < self.T < float("inf"):

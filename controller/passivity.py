@@ -14,7 +14,7 @@ _FIRST = 64  # number of intervals of [0, pi] at the start
 _EVALUATIONS = 1 << 15
 _REACH = 0.5  # a bound is computed for half-widths up to _REACH/|(zI - A)^-1|
 _UNIT = 2.0**-53  # largest relative error of one rounding
-_NOISE = 1e-4  # covariance of the noise in every state, relative to that of the noise at the inputs
+_NOISE = 1e-4  # variance of the noise added to each state, relative to |B|^2; the noise at the inputs adds B B'
 _INFLATED = 1.001  # factor on norms against rounding
 _TOGETHER = 2**18  # largest number of entries of resolvents in memory
 
