@@ -795,7 +795,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
         return _shell(assessment)
     if limits.energy_budget is not None:
         if own:
-            return None, f"the condition {own.name}, which is your own, does not cover forces that an account scales"
+            return None, f"your own condition {own.name} does not cover forces that an energy account scales"
         return _account(assessment, "whatever computes the forces"), None
     if own and decisive.certified:
         ranges = None if decisive.guarantee == ANY else _over_ranges(assessment)
@@ -868,7 +868,7 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
         why = f"{needs.condition} holds in {needs.guarantee}" if needs.certified else needs.shortfall
         return None, f"the coupling is not certified for every environment: {why}"
     world = not callable(assessment.environment)
-    where = "and gravity and springs of the scene released, whatever the scene does" if world else None
+    where = "and what gravity and springs of the scene release, whatever the scene does" if world else None
     return _account(assessment, where or "whatever computes the force"), None
 
 

@@ -653,7 +653,7 @@ def test_budgets_need_a_coupling_certified_without_them(scenario):
         certified_coupling(scenario, "I", None, None, 1, SpringDamper((5000.0, 5000.0), (0.1, 0.1)), energy_budget=0.01)
     mine = type("Mine", (type(THIS_ENVIRONMENT),), {"name": "mine"})()
     assert certified_coupling(scenario, "I", None, mine, 1).certified
-    with pytest.raises(SafetyStop, match="mine, which is your own, does not cover forces that an account scales"):
+    with pytest.raises(SafetyStop, match="your own condition mine does not cover forces that an energy account scales"):
         certified_coupling(scenario, "I", None, mine, 1, energy_budget=0.01)
 
 
