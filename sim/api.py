@@ -148,7 +148,7 @@ def simulate(
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
         f (N, m) [N] (the devices feel -f), and `meta`. `meta["stability"]` has the growth rates [1/s] of the trace and
-        of the exact loop, the verdict, and the ticks at the force limit. It is None under varying delays, with
+        of the exact loop, the verdict, and the ticks at the force limit. It is None if delays switch, with
         `environment` and in a MuJoCo scene. `meta["assessment"]` states the guarantee of this run, or why there is
         none, and `meta["energy_budget"]` how often forces were limited (None without budget and shell).
 

@@ -181,10 +181,7 @@ class ComparedCoupling:
         for key, requirement in judged.requirements.items():
             demand, reason = curves.demands[key], requirement.reason
             if demand is None:
-                reason = (
-                    reason
-                    or f"this coupling is no V in feedback around the environment, so there is no curve for {key}"
-                )
+                reason = reason or f"this coupling has no compliance V, so there is no curve for {key}"
             conditions[key] = ConditionCurve(requirement, requirement.ratio, demand, reason)
         return cls(
             name,

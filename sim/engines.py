@@ -51,9 +51,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = (
-    256  # size of two caches of an engine: the plants held over a period, and the products for (period, latch times)
-)
+_MOST_MAPS = 256  # size of two caches of an engine: plants held over a period, and products by period and latch times
 _CALLS_FOR_THREADS = 128  # A batch with fewer calls of mj_forward in a tick is faster in one thread.
 
 

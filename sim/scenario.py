@@ -75,12 +75,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     name: str
-    unit: PositionUnit = (
-        "m"  # unit of positions; with "rad", for rotary devices, forces are in N m, dampings in N m s/rad
-    )
-    radius: float | None = (
-        None  # [m] distance of the hand from a rotary device's axis; sessions limit the force at the hand
-    )
+    unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with forces in N m and dampings in N m s/rad
+    radius: float | None = None  # [m] from a rotary device's axis to the hand; sessions limit the force at the hand
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples], the paper's equation 4
     psi: _Delays = _UNSAID  # environment delays [samples], equation 5; default: 0
@@ -95,7 +91,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold for all periods up to T_max
-    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; latencies are shorter
+    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; latencies must be less
     period: Periods | None = None  # the simulated periods; the coupling is computed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 

@@ -316,7 +316,7 @@ class _Frozen(ExactVerdict):
 
 @dataclass(frozen=True)
 class _Contact:
-    """Contacts with walls in a run, and the frozen loops between which contacts switch the loop."""
+    """Contacts with walls in a run, and the verdicts on the frozen loops."""
 
     made: int  # number of times that a wall was touched
     ticks: int  # number of ticks in which some wall was touched

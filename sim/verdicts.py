@@ -180,7 +180,7 @@ class Traces:
         yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
         some = f"{self.witnessed} of {self.humans}: random ones, the nearest to the limit, all lossless ones"
         yield "traces by both engines", some if 0 < self.witnessed < self.humans else None
-        undecided = f"undecided in {self.duration_s:g} s: {self.undecided} of {self.measured}, see their eigenvalues"
+        undecided = f"undecided in {self.duration_s:g} s: {self.undecided} of {self.measured}; their eigenvalues decide"
         yield "growth on traces", undecided if self.undecided else None
         yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
 

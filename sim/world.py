@@ -128,7 +128,7 @@ def _elsewhere(assessment: Assessment, network: Network | None) -> str:
         return ""
     scene = getattr(assessment.environment, "world", None)
     stale = scene is None or network.scene_digest != scene.digest
-    changed = ", of a scene with other contents: call linearise again" if stale else ""
+    changed = ", and the scene is another one or has changed: call linearise again" if stale else ""
     return f" The coupling is certified for the linear network of {network.linear_model_of} only{changed}."
 
 
