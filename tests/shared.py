@@ -74,7 +74,7 @@ springs = [
 """
 #: certified for the default environment and the constant delays (1, 2) only
 STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
-#: certified for every passive environment; with delays that switch within [1, 2] it needs 1.078 of the 1.37 N s/m
+#: certified for every passive environment; needs 1.078 N s/m in Figure 4 with delays that switch within [1, 2]
 SOFT = SpringDamper((878.767, 551.883), (0.386476, 0.521984))
 #: Figure 4 with springs that are four times softer
 SOFT_NETWORK = Network(

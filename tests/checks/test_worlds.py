@@ -15,7 +15,7 @@ PAIRS, TICKS = 50, 500
 
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
-def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
+def test_hands_gain_only_budget_and_released_energy(name, lossless):
     """Hands gain at most the energy budget W0 plus what the scene released, at delays of 0 to 3 samples."""
     rng, acted, worst = np.random.default_rng(7), 0, -np.inf
     for run in range(PAIRS):

@@ -131,7 +131,7 @@ def test_damped_walls_need_the_known_damping(K, B, theta, T, present, required):
     assert best.share == pytest.approx(required, rel=3e-3 if required < 0.001 else 1e-4)
 
 
-def test_known_devices_need_equal_damping_for_bare_springs():
+def test_bare_springs_gain_nothing_from_known_devices():
     """The motor alone oscillates on a spring without damper as soon as delta < K T/2, so no beta suffices below it."""
     best = sweep_of(wall(1000.0, 0.0, 0, 1e-3), one(1e-3, 1.0)).best(0.4999)
     assert best.share == np.inf

@@ -109,7 +109,7 @@ def test_known_devices_keep_an_own_fact(shipped, fact):
 
 
 @pytest.mark.slow
-def test_a_known_device_takes_facts_from_plain():
+def test_known_devices_take_their_plain_conditions_facts():
     own = type(
         "Own", (KnownDevice,), {"name": "own", "covers": ("psi",), "plain": condition(ThisEnvironment, FACTS[2])}
     )
@@ -217,7 +217,7 @@ def test_no_friction_covers_steps_with_own_facts():
     assert [each is not None and each.friction_needed is None for each in steps] == [False, True]
 
 
-def test_accounts_need_an_own_condition_for_any_environment():
+def test_accounts_refuse_own_conditions_of_one_environment():
     assert assess(PAIR, SOFT, energy_budget=1e-3).guarantee
     assert assess(PAIR, SOFT, condition=Twenty(), energy_budget=1e-3).guarantee is None
     assert assess(PAIR, SOFT, environment=lambda u: u).guarantee.own is None

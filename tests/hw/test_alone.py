@@ -1,4 +1,4 @@
-"""Boards without a host arm only right axes, and drop forces at faults: hw/firmware/haptic_alone.h, compiled here.
+"""Boards without a host arm only correct axes and drop forces at faults: hw/firmware/haptic_alone.h, compiled here.
 
 The handle is a mass with damping, Coulomb friction and a constant force such as gravity. With Coulomb friction it is
 stepped ten times a tick, otherwise once.
@@ -114,7 +114,7 @@ def seeds(board, noise):
 
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("load", [{}, {"friction": 0.2}, {"gravity": 0.05}, {"speed": 0.03}], ids=str)
-def test_right_axes_are_armed(board, noise, load):
+def test_correct_axes_are_armed(board, noise, load):
     for seed in seeds(board, noise):
         assert Bench(board, seed, noise, **load).armed() == (RUNNING, 0)
 

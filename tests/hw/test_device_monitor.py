@@ -158,7 +158,7 @@ def hand_driven(scenario, link_couplings, tested=False, behind=()):
 
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, link_couplings):
-    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze a pulse of 0.19 mm is a jump."""
+    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze a pulse of 0.3 mm is a jump."""
     session, send = hand_driven(scenario, link_couplings, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0

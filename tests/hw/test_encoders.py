@@ -605,7 +605,7 @@ def test_coarse_encoders_get_more_time():
 
 @pytest.mark.parametrize(("friction", "stops"), [(0.45, False), (0.7, True)])
 def test_friction_hides_twice_its_force(friction, stops):
-    """A hand of 500 N/m holds a handle with dry friction F. It rests until the force has turned round by 2 F."""
+    """A hand of 500 N/m holds a handle with dry friction F. It rests until the force has reversed by 2 F."""
     monitor, x = monitor_of(1e-5), 0.0
     with expect_stop("still encoder: 1 ") if stops else nullcontext():
         for k in range(round(5.0 / T)):

@@ -127,7 +127,7 @@ def test_axes_moved_as_asked_arm(scenario, link_couplings, monkeypatch):
     assert rehearsal.armed_us > 1e6 * (0.1 + 2 * 0.5 + 0.3)  # the measurement, two rests, the time to let go
 
 
-def test_no_force_shows_exchanged_axes(scenario, link_couplings):
+def test_motor_tests_do_not_reveal_exchanged_axes(scenario, link_couplings):
     """Without the person the motor test passes, because motors and encoders are exchanged and reversed together."""
     rehearsal = rehearsal_of(scenario, link_couplings, "exchange", "motor=-1", "reverse", operator=None)
     assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED

@@ -183,7 +183,7 @@ def test_own_hand_populations_agree_in_both_engines():
 
 @pytest.mark.slow
 def test_the_adversary_searches_the_populations_hands():
-    """The search finds more growth than a quarter as many random draws, and reports the true growth of its hands."""
+    """The search finds more growth than random draws, a quarter as many, and reports the true growth of its hands."""
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
     F = assemble(scenario, NoCoupling()).F

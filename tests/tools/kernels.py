@@ -62,7 +62,7 @@ ROUNDING = (
     "tests/design/test_combinations.py::test_the_stiffest_coupling_attains_the_latency_limit",
     "tests/design/test_encoder_steps.py::test_ten_micrometre_steps_need_known_friction",
     "tests/design/test_export.py::test_unsolved_vectors_are_zero_with_their_slips",
-    "tests/design/test_known_device.py::test_known_devices_need_equal_damping_for_bare_springs",
+    "tests/design/test_known_device.py::test_bare_springs_gain_nothing_from_known_devices",
     "tests/design/test_known_device.py::test_the_proof_is_tight_for_the_papers_loop",
     "tests/design/test_optimal.py::test_late_walls_match_their_closed_form",
     "tests/design/test_optimal.py::test_matrix_routines_equal_those_of_scipy",
