@@ -303,7 +303,7 @@ def _covered_limits(
         return ForceLimits(each.limiter_rho, f"{swept}{each.condition} covers limited forces", proof=each.proof)
     extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
     if not extended:
-        return ForceLimits(None, "no certified condition that extends to limited forces")
+        return ForceLimits(None, "no condition that extends to limited forces is certified")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
     covered = _by_its_own_block(loop, coupling, proof, known, extended[0], c)
     if covered.rho is None and len(extended) > 1:

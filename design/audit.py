@@ -126,7 +126,7 @@ def _stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest
         return _Stiffest(unknown, f"certified at the stiffest K tried, {_STIFFEST:g} N/m")
     largest = _largest(ratio, scale, _SOFTEST / K.max())
     if largest is None:
-        return _Stiffest(unknown, f"with this B, no multiple of K tried down to {_SOFTEST:g} N/m is certified")
+        return _Stiffest(unknown, f"with this B, no multiple of K tried, down to {_SOFTEST:g} N/m, is certified")
     return _Stiffest(tuple((largest * K).tolist()))
 
 
@@ -153,7 +153,7 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
         largest = edge(ratio, softest, bound) if suffices(ratio(softest)) else _largest(ratio, bound, _SOFTEST)
         stiffest.append(largest)
         if largest is None:
-            reasons.append(f"with B = {B:g} N s/m, no K tried down to {_SOFTEST:g} N/m is certified")
+            reasons.append(f"with B = {B:g} N s/m, no K tried, down to {_SOFTEST:g} N/m, is certified")
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 

@@ -89,7 +89,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     level = even_level(loop, T) if loop.levels else damping
     below = len(shortage) == len(damping) and ((shortage >= 0) & (shortage < damping)).all()
     if not below or (loop.levels and not positive_definite(level - np.diag(shortage))):
-        raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
+        raise ValueError("the multiplier Phi must be at least 0 and below the device damping on every channel")
     short = np.flatnonzero(shortage)
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
@@ -372,7 +372,7 @@ class Condition(ABC):
     @property
     def claim(self) -> str:
         """The sentence that reports print if a user's own condition holds."""
-        return f"only the block of {self.name} is proved; that it keeps this loop safe is yours to show"
+        return f"only the block of {self.name} is proved; you must show that it keeps this loop safe"
 
     def remark(self, needs: Requirement) -> str:
         return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"

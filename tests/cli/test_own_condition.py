@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
     return place
 
 
-CLAIMED = "yours to show"  # words of Condition.claim
+CLAIMED = "you must show"  # words of Condition.claim
 
 
 def run(command: str, *words: str) -> int:

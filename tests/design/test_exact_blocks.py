@@ -485,10 +485,10 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
         return forged(loop, coupling, proof, multipliers={"Phi": (value,)})
 
     assert T / (2 * (a * (T / phi - 2 * a) / (4 * T / phi - 6 * a))) < 4
-    assert with_phi(4.0) == "the multiplier Phi is not between 0 and the device damping on every channel"
+    assert with_phi(4.0) == "the multiplier Phi must be at least 0 and below the device damping on every channel"
     assert NEGATIVE.search(with_phi(2.0))
     assert NEGATIVE.search(with_phi(0.01))
-    assert with_phi(-0.1) == "the multiplier Phi is not between 0 and the device damping on every channel"
+    assert with_phi(-0.1) == "the multiplier Phi must be at least 0 and below the device damping on every channel"
 
 
 def test_stored_figures_are_checked_to_a_millionth():
