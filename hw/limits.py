@@ -156,9 +156,10 @@ class SafetyLimits:
     def check_jolt(self, path: Sequence[tuple[float, ...]], gaps: tuple[int, int, int], most: Sequence[float]) -> None:
         """Raise SafetyStop where an axis jumped by more than `most` (m,) [m] between the second and third position.
 
-        `path` has four displacements (m,) [m], with `gaps` [ticks] between them. A counting error leaves a pulse of the
-        mean speed between two positions. The size of the pulse is the smaller of the speeds gained and lost, times the
-        middle gap. A handle that reaches a stop only loses speed. `largest_pulse` bounds the pulses of real motions.
+        `path` has four displacements (m,) [m], with `gaps` [ticks] between them. A counting error is a pulse: the mean
+        speed in the middle gap is above both of its neighbours, or below both. The pulse's size is the smaller
+        difference times the middle gap. A handle that reaches a stop only loses speed. `largest_pulse` bounds the
+        pulses of real motions.
         """
         p, q, r = gaps
         for i, (a, b, c, d, allowed) in enumerate(zip(*path, most, strict=True), start=1):
@@ -242,8 +243,8 @@ def largest_pulse(gaps: tuple[int, int, int], T: float, push: float, mode: float
 
     Mean speeds over p and q ticks differ by at most A (p + q)/2 under an acceleration up to A, here `push` [m/tick^2].
     A motor may also swing on its transmission with the amplitude `speed` v [m/s] at frequencies w [rad/s] up to `mode`.
-    The mean speed over n ticks then is v sinc(n w T/2) times the phase of their middle. A rigid device (its `mode` is
-    infinite) swings less than a push explains: 0.25 kg would need 66 N for 0.5 m/s at 84 Hz.
+    The mean speed over n ticks then is v sinc(n w T/2) times the phase of their middle. For a rigid device (its `mode`
+    is infinite) A bounds all pulses: a swing of 0.25 kg with 0.5 m/s at 84 Hz would need 66 N.
     """
     p, q, r = gaps
     forced, swing = q * (min(p, r) + q) / 2 * push, 0.0

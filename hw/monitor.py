@@ -34,7 +34,7 @@ _FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops 
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """Settings by which a session judges its link and arms."""
+    """Settings of a session: its link, its conditions for arming, and its tests."""
 
     baud: int | None = None  # baud rate of a UART; None for a link without UART (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
@@ -139,7 +139,8 @@ class Measurement:
     may have come together with a younger answer, which hides it. Then a second round measures half as many ages
     exactly. The host still answers every STATE, so that the load of the link is the same, but it sends most answers for
     a wrong tick, so that the device ignores them. The distances of accepted answers are random, so that bursts meet
-    each answer with the same probability. A distance is at least the longest age, but not more than theta.
+    each answer with the same probability. The least distance is the longest age, or theta if that is less; the largest
+    distance is below twice the least.
     """
 
     def __init__(self, needed: int, theta: int, T: float) -> None:
@@ -427,6 +428,7 @@ class CommandMonitor:
         return wrong
 
     def _could(self, state: State, last: tuple[int, ...], told: tuple[int, ...] | None) -> bool:
+        """Return whether `state.applied` is possible after the force `last`, for a device that was `told` a force."""
         if state.phase == Phase.HOLDING:
             return state.applied == last
         if told is None:

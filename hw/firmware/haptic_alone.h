@@ -68,7 +68,7 @@ typedef struct {
     ha_real gain;
     ha_real before[PROCESS_CHANNELS], older[PROCESS_CHANNELS]; /* [m] positions at the last tick and the tick before */
     ha_real reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
-    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] extremes since the last motion; high: noise in ha_listen */
+    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] extremes since the last motion; in ha_listen high is the noise */
     ha_real still[PROCESS_CHANNELS];                       /* [m] range in which a sensor rests */
     uint16_t pressed[PROCESS_CHANNELS];                    /* ticks in a row under a force without a motion */
 } ha_runner;
