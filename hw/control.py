@@ -23,15 +23,15 @@ import numpy as np
 from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.law import Law
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import limiter_rho, required_damping
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
-from haptic_loop.hw.encoders import EncoderMonitor, EncoderTest, Expected
-from haptic_loop.hw.limits import Heat, SafetyLimits, Units, largest_pulse, next_gain
+from haptic_loop.hw.encoders import CheckedAxes, EncoderMonitor, EncoderTest, Expected
+from haptic_loop.hw.limits import Heat, Units, largest_pulse, next_gain
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
 from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.couplings import assessed, choose, given
@@ -73,22 +73,22 @@ class _HostController:
 
 
 def host_controller(
-    loop: Loop,
+    scenario: Scenario,
     coupling: Coupling,
     link: int,
     cap: Sequence[float],
     lag: Sequence[float] | None = None,
     behind: Sequence[int] = (),
-    balls: Sequence[slice] = (),
 ) -> Controller:
-    """Return a controller for the loop, at rest and without the delay that the link adds.
+    """Return a controller for the scenario's loop, at rest and without the delay that the link adds.
 
     The link adds `link` ticks; several boards add `behind` (m,) more. With `lag`, the rho (m,) [N/m] of a limiter,
-    forces are limited to `cap` (m,) [N], and the channels of each slice in `balls` as one vector.
+    forces are limited to `cap` (m,) [N], or as vectors where the scenario limits vectors.
     Raises ValueError where the link is slower than a delay of the loop.
     """
-    waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
-    return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
+    loop, theta = scenario.loop("I"), scenario.theta  # The case changes no force.
+    waits = tuple(n - link - more for n, more in zip(theta, behind or (0,) * len(theta), strict=True))
+    return _HostController(loop.delayed(waits).law(coupling, cap, lag, scenario.limiter_limits[1]))
 
 
 def _fill(previous: tuple[float, ...], x: tuple[float, ...], ticks: int) -> list[tuple[float, ...]]:
@@ -189,7 +189,7 @@ class WorldController:
         scene = scene_of(scenario, coupling)  # raises InputError for a coupling without V
         assert V is not None
         self.T, self.port, self.shell = scenario.T, scene.port(cap, scenario.balls), Shell(V, start=start)
-        self.least = 0.0  # [J] least sum so far over ticks of f'(u[k] - u[k-1]), with positions u of the contacts
+        self.least = 0.0  # [J] least value so far of the sum of f'(u[k] - u[k-1]), with positions u of the contacts
         self.seconds: list[float] = []  # CPU time of each step of the scene
         self._start, self._sent = start, np.zeros((len(waits), 1))
         self._open = False  # whether the shell has not yet booked the force of the current tick
@@ -278,30 +278,27 @@ class Drive:
     def __init__(
         self,
         arming: Arming,
-        units: Units,
-        limits: SafetyLimits,
+        axes: CheckedAxes,
+        expected: Expected,
         settings: monitor.LinkSettings,
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
-        expected: Expected,
-        still: Sequence[int],
     ) -> None:
-        """Take `still` (m,) [counts], the range of encoders at rest, and `expected`, which predicts tested motions."""
-        self.controller, config = arming.program.controller(limits.cap), arming.config
-        self.units, self.config, self.limits = units, config, limits
-        self.T = T = self.controller.T
+        """Take `expected`, which predicts the motions of `axes` in their tests."""
+        (limits, units, T, still), config = axes, arming.config
+        self.limits, self.units, self.T, self.config = limits, units, T, config
+        self.controller = arming.program.controller(limits.cap)
         self.gain = 0.0  # factor of the controller's forces
         self.ended = False  # whether the gain has fallen to 0 and the last motor test, if any, is passed
         self.force = (0.0,) * config.axes  # [N] last force sent
         self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
-        about = limits, T, units, still
-        first = EncoderTest(*about, expected, config.theta == 0)
-        last = EncoderTest(*about, expected, config.theta == 0, first.sizes)
+        first = EncoderTest(axes, expected, config.theta == 0)
+        last = EncoderTest(axes, expected, config.theta == 0, first.sizes)
         self._test, self._last_test = (first, last) if settings.test_encoders else (None, None)
         self.remarks = first.remarks  # what the test at arming could not judge
-        self.encoders = EncoderMonitor(*about)
+        self.encoders = EncoderMonitor(axes)
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
@@ -362,50 +359,49 @@ class Drive:
             if closing and self._last_test and self.gain == 0:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain == 0 and test is None
-        before = self._counters.limited
         shaped = self.limits.shape(wanted, self.force, self.gain, self.T, test)
-        force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
-        if budget := self._arming.budget:
-            allowed = budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
-            if allowed != steps:
-                force, steps = self.units.forces(allowed), allowed
-                self._counters.limited += 1
-        if self.world:
-            force, steps = self._through_shell(self.world, force, steps, x, state, ticks, test)
-        self.x, self.force = x, force
+        steps = self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
+        allowed = sent = steps
+        if self._arming.budget or self.world:
+            allowed, sent = self._within_energy(steps, test, state, x, ticks)
+        limited = allowed != steps
+        self.x, self.force = x, self.units.forces(allowed) if limited else shaped.force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
+        self._counters.limited += limited
         if self._commands:
-            self._commands.tell(state.tick, steps)
-        limited = self._counters.limited > before
-        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test, limited))
-        return steps
+            self._commands.tell(state.tick, sent)
+        self._record(TraceRow(state.tick, x, wanted, self.gain, sent, state, self._arming.number, test, limited))
+        return sent
 
-    def _through_shell(
+    def _within_energy(
         self,
-        world: WorldController,
-        force: tuple[float, ...],
         steps: tuple[int, ...],
-        x: tuple[float, ...],
-        state: State,
-        ticks: int,
         test: tuple[float, ...] | None,
-    ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return force (m,) [N] and steps within a world's energy accounts. A test force replaces the scene's force."""
+        state: State,
+        x: tuple[float, ...],
+        ticks: int,
+    ) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the steps that the energy accounts allow, and those to send now, as a world may delay its forces.
+
+        In a world, a `test` force replaces the scene's force.
+        """
+        tick = x, np.array(self.units.forces(state.applied)), ticks - 1
+        if self._arming.budget:
+            steps = self._arming.budget.limit(steps, *tick)
+        if self.world is None:
+            return steps, steps
         nothing, plan = (0,) * len(steps), self._arming.test_plan
         pushes = plan is not None and test is not None and any(test)
-        allowed = world.limit(nothing if pushes else steps, self.units.force_step)
-        sent = world.later(allowed, ticks)
+        allowed = self.world.limit(nothing if pushes else steps, self.units.force_step)
+        sent = self.world.later(allowed, ticks)
         if plan is None or test is None:
-            world.end_test()
-        else:
-            applied = np.array(self.units.forces(state.applied))
-            tested = world.limit_test(plan, steps if pushes else nothing, x, applied, ticks - 1)
-            if pushes:
-                allowed = tested
-                sent = tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
-        self._counters.limited += allowed != steps
-        return (force if allowed == steps else self.units.forces(allowed)), sent
+            self.world.end_test()
+            return allowed, sent
+        tested = self.world.limit_test(plan, steps if pushes else nothing, *tick)
+        if not pushes:
+            return allowed, sent
+        return tested, tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
 
     def _check_motion(self, positions: Sequence[tuple[float, ...]], seconds: float) -> None:
         """Raise SafetyStop where handles jumped, or moved faster than the speed limit.
@@ -529,8 +525,7 @@ class CertifiedCoupling:
         if is_world(self.scenario):
             waits = [n - self.link for n in self.scenario.theta]
             return WorldController(self.scenario, self.chosen.coupling, start or 0.0, cap, waits)
-        loop, balls = self.scenario.loop(self.case), self.scenario.limiter_limits[1]
-        return host_controller(loop, self.chosen.coupling, self.link, cap, lag, self.behind, balls)
+        return host_controller(self.scenario, self.chosen.coupling, self.link, cap, lag, self.behind)
 
     def capped(self, cap: Sequence[float]) -> Assessment:
         """Return the assessment with the force cap (m,) [N] of a session; no proof depends on this cap."""

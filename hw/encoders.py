@@ -20,8 +20,8 @@ from haptic_loop.sim.scenario import Scenario
 _IMPULSE = 0.1  # [s] longest time without a motion for which a force change of 1 N (EncoderMonitor: _newton) may act
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
-_PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, the two directions always mix
-_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if its force exceeds _TEST_FORCE; a one-sided motor: 0.4
+_PULSE = 2 / 3  # share of half a period in which the test force acts; pauses separate the motions of both directions
+_TEST_SPEED = 0.1  # [m/s] speed in the last test, whose force may exceed _TEST_FORCE; a one-way motor reaches 0.4 m/s
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio of a motion to the expected motion, or of the expected motion to it
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 2e-5 of a motion at 2 Hz
@@ -77,8 +77,9 @@ class AxisCheck:
     """Let a person move one axis after the other in its + direction while no force acts.
 
     This finds axes that are reversed or exchanged with motors and encoders together, which no force can show. Motions
-    are judged between places where all handles rest, so that a handle that sags slowly passes no axis. A wrong motion
-    is asked for again from the same place, and only the second one is an error, because people move wrong handles.
+    are judged between places where all handles rest, so that a handle that sags slowly passes no axis. People move
+    wrong handles, so after a wrong motion the person tries again from the same place. The same wrong motion twice is
+    an error.
     """
 
     def __init__(self, units: Units, T: float, lever: float) -> None:
@@ -202,13 +203,22 @@ class _Fit(NamedTuple):
         return cls(shares, 12**0.5 * noise * lengths, bool(shares[-1] ** 2 > most), rest, fitted)
 
 
+class CheckedAxes(NamedTuple):
+    """The axes whose encoders and motors are checked."""
+
+    limits: SafetyLimits
+    units: Units
+    T: float  # [s]
+    still: tuple[int, ...]  # (m,) [counts] ranges in which the encoders rest; a motion within its range is noise
+
+
 class _Block:
     """The motions (m,) in one block of a test, compared with the expected motion of the tested axis."""
 
-    def __init__(self, rows: Array, axis: int, units: Units, still: Sequence[int], inertia: float) -> None:
-        """Take the rows of EncoderTest, and the `inertia` m / T^2 [N/m] of the tested axis."""
+    def __init__(self, rows: Array, axis: int, axes: CheckedAxes, mass: float) -> None:
+        """Take the rows of EncoderTest, and the `mass` [kg] of the tested axis."""
         t, expected, loaded, even, *counts = rows.T
-        q, ranges = np.array(units.encoder_step), np.array(still)
+        q, ranges = np.array(axes.units.encoder_step), np.array(axes.still)
         self.span, self.reach = np.ptp(counts, axis=1), np.ptp(expected)  # [counts], [m]
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
         self._fast = lambda signal: signal - smooth @ (smooth.T @ signal)
@@ -225,11 +235,11 @@ class _Block:
         self.moves = self.span > ranges
         # `late` is the integral of `wanted`, so that a swing at the frequency of the force counts at any phase.
         self.swings = bool(np.linalg.norm(both.T @ tested) > _ALIVE * math.sqrt(power))
-        # A block lasts about as long as the window in which the noise was measured, so one count more is a motion.
+        # A block lasts about as long as the window in which the noise was measured: a motion exceeds it by 2.
         self.follows = (self.span > np.maximum(1, ranges // 2 + 1)) & (fit > _FIT)
         #: whether the tested axis moves like a free handle, and not like one in a hand as heavy as the device
         self.free = bool(fit[axis] > _FIT > (heavy @ tested) ** 2 / ((heavy @ heavy or 1.0) * own[axis]))
-        self._t, self._slow, self._inertia = t, (position - moved)[:, axis], inertia
+        self._t, self._slow, self._inertia = t, (position - moved)[:, axis], mass / axes.T**2  # [N/m]
         self._slip = 0.1 * np.abs(speed).max() or 1.0  # [m/s]
         self._motion, self._shapes, self._even = (tested, float(noise[axis])), (wanted, rate), even
 
@@ -269,33 +279,31 @@ class EncoderTest:
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
     in rehearsals (`held`). With unknown hands, two blocks in a row must agree, and blocks are repeated until the person
-    lets go, at most for 5 s. A small or late motion then counts as wrong only if a free handle would have its shape and
-    a handle in a hand as heavy as the device would not. The two shapes differ for a device with a transmission; for a
-    rigid device they are equal. If an axis never moves as a free handle does, the session does not finish. If it swings
+    lets go, at most for 5 s. A small or late motion then counts as wrong only if its shape fits a free handle, but not
+    a handle in a hand as heavy as the device. The two shapes differ for a device with a transmission; for a rigid
+    device they are equal. If an axis never moves as a free handle does, the session does not finish. If it swings
     at the frequency of the force, at any phase, the message asks to let go: a dead motor would not swing it.
     """
 
     def __init__(
         self,
-        limits: SafetyLimits,
-        T: float,
-        units: Units,
-        still: Sequence[int],
+        axes: CheckedAxes,
         expected: Expected,
         at_once: bool = False,
         before: Sequence[tuple[float, float]] | None = None,
     ) -> None:
-        """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
+        """Test the axes one after the other against the `expected` motion.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
         `before` has the sizes and one-sided shares of motions at arming, which the test at arming stores in `sizes`.
         """
         self._at_once, self._closing, self._before = at_once, before is not None, before
         self.sizes: list[tuple[float, float]] = []
-        push = 2 * _TEST_SPEED / (limits.lever * _PULSE * _TEST_HALF) * self._closing
-        most = [max(_TEST_FORCE * limits.lever, push * mass) for mass in expected.mass]
-        self._strongest = list(map(min, limits.cap, most))
-        self._T, self._units, self._still, self._expected = T, units, still, expected
+        self._axes, self._units, self._expected = axes, axes.units, expected
+        lever, T = axes.limits.lever, axes.T
+        push = 2 * _TEST_SPEED / (lever * _PULSE * _TEST_HALF) * self._closing
+        most = [max(_TEST_FORCE * lever, push * mass) for mass in expected.mass]
+        self._strongest = list(map(min, axes.limits.cap, most))
         self._lead, self._half = max(1, round(_TEST_BEFORE / T)), max(2, round(_TEST_HALF / T))  # [ticks]
         self._axis, self._last = -1, None
         self.remarks: list[str] = []  # what the test could not judge
@@ -325,7 +333,7 @@ class EncoderTest:
         if self._ticks > self._lead + 4 * self._half:
             if self._passed():
                 self._next_axis()
-                if self._axis == len(self._still):
+                if self._axis == len(self._strongest):
                     return None
             elif self._block == self._blocks - 1:
                 raise SafetyStop(self._unanswered())
@@ -336,7 +344,7 @@ class EncoderTest:
         number, place = divmod(since - 0.5 + half / 2, half)
         sign = (1 - 2 * (number % 2)) * (since > 0 and abs(place - half / 2) < half * _PULSE / 2)
         size = self._strongest[self._axis] * 2.0 ** min(0, self._block + 1 - _BLOCKS)
-        return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._still)))
+        return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._strongest)))
 
     @property
     def request(self) -> str | None:
@@ -364,7 +372,7 @@ class EncoderTest:
     def _verdict(self) -> str | None:
         """Return the fault that this block shows, "" if the axis has answered well, or None if it has not answered."""
         axis, name, mass = self._axis, f"axis {self._axis + 1}", self._expected.mass[self._axis]
-        self._answer = block = _Block(np.array(self._rows), axis, self._units, self._still, mass / self._T**2)
+        self._answer = block = _Block(np.array(self._rows), axis, self._axes, mass)
         size, moves, weaker, self._weaker = float(block.size[axis]), block.moves[axis], self._weaker, math.nan
         others = [i + 1 for i in np.flatnonzero(block.follows & (abs(block.size) > _CROSS)).tolist() if i != axis]
         self._swings |= bool(moves and block.swings)
@@ -437,7 +445,7 @@ class EncoderTest:
             return f"{free}. If nobody held it, motor or encoder is wrong"
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
-        if (moved := self._answer.span[self._axis]) > self._still[self._axis]:
+        if (moved := self._answer.span[self._axis]) > self._axes.still[self._axis]:
             return f"axis {axis} does not follow {at} as a free handle: let go of it while arming{self._or_undeclared}"
         return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"
 
@@ -454,14 +462,14 @@ class EncoderMonitor:
     friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c.
     """
 
-    def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
-        """Take `still` (m,) [counts], the ranges in which the encoders rest."""
-        self._lever, self._T, self._units, self._still, m = limits.lever, T, units, still, len(still)
+    def __init__(self, axes: CheckedAxes) -> None:
+        limits, self._units, self._T, self._still = axes
+        self._lever, m = limits.lever, len(axes.still)
         #: (m,) [N] unit of force changes: 1 N, or half of a cap below 2 N
         self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]
         self._band: list[list[int]] | None = None
         tremor = _TREMOR / limits.lever
-        self._shown = [(n + 1) * q <= tremor for n, q in zip(still, units.encoder_step, strict=True)]
+        self._shown = [(n + 1) * q <= tremor for n, q in zip(axes.still, axes.units.encoder_step, strict=True)]
         self._quiet = [0.0] * m  # [s] time under a force without a motion that shows a tremor
         self._reference = [0.0] * m  # [N] force at the last motion
         self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion

@@ -190,8 +190,8 @@ def _again(
     if recipe.scenario.environment.world:
         raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
     m, coupling, (wanted, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
-    loop, added = recipe.scenario.loop("I"), (recipe.lag, recipe.behind, recipe.scenario.limiter_limits[1])
-    controller = host_controller(loop, coupling, recipe.link_delay, recipe.limits.cap, *added)
+    link_delay, cap = recipe.link_delay, recipe.limits.cap
+    controller = host_controller(recipe.scenario, coupling, link_delay, cap, recipe.lag, recipe.behind)
     units, force = Units((1.0,) * m, recipe.force_step, (1,) * m), (0.0,) * m
     budget, missed = recipe.energy_budget and SentBudget(recipe.energy_budget), 0
     for k in ticks:

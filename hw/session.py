@@ -17,7 +17,7 @@ import numpy as np
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
-from haptic_loop.hw.encoders import ELSEWHERE, AxisCheck, EncoderNoise, Expected
+from haptic_loop.hw.encoders import ELSEWHERE, AxisCheck, CheckedAxes, EncoderNoise, Expected
 from haptic_loop.hw.limits import DRIVING, ENDED, SafetyLimits, Stage, Units, probe_delay, watchdog_for
 from haptic_loop.hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.models.device import symmetric
@@ -29,7 +29,7 @@ _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimi
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest sum of hold and ramp
 STRONGEST = 12.0  # [N] largest force of a device at the hand, whatever a scenario allows
-#: default force cap [N] at the hand; a smaller one keeps free handles below this speed [m/s], whatever is faulty
+#: [N] default force cap at the hand; less for a device whose free handle would exceed FREE_SPEED [m/s] under it
 USUAL_CAP, FREE_SPEED = 1.3, 1.0
 
 Said = tuple[wire.Force | wire.Stop, ...]  # messages to the device
@@ -138,8 +138,8 @@ class Session:
             arming = Arming(len(self.armings), self.program, self.config, *self._accounts(self.config))
             self.armings.append(arming)
             assert self._noise
-            told = self.units, self.limits, self.settings, self.counters, self.record
-            self.drive = Drive(arming, *told, self._expected, self._noise.still)
+            axes = CheckedAxes(self.limits, self.units, self.scenario.T, self._noise.still)
+            self.drive = Drive(arming, axes, self._expected, self.settings, self.counters, self.record)
             if self.drive.world:
                 self.worlds.append(self.drive.world)
             self._after = Stage.FINISHED

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from haptic_loop.hw.encoders import EncoderMonitor
+from haptic_loop.hw.encoders import CheckedAxes, EncoderMonitor
 from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.protocol import SafetyStop
 
@@ -50,7 +50,8 @@ def still_holds(holds: int, seed: int = 0) -> tuple[int, int]:
 
 
 def _stopped(counts: list[int], applied: list[int], step: float) -> bool:
-    monitor = EncoderMonitor(SafetyLimits((12.0,)), T, Units((step,), (FORCE_STEP,), (10**6,)), (1,))
+    units = Units((step,), (FORCE_STEP,), (10**6,))
+    monitor = EncoderMonitor(CheckedAxes(SafetyLimits((12.0,)), units, T, (1,)))
     try:
         for n, force in zip(counts, applied, strict=True):
             monitor.check((n,), (force,), 1)

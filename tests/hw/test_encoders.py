@@ -13,7 +13,7 @@ from sessions import in_fork, inject_faults
 from shared import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
-from haptic_loop.hw.encoders import EncoderMonitor, EncoderNoise, EncoderTest, Expected
+from haptic_loop.hw.encoders import CheckedAxes, EncoderMonitor, EncoderNoise, EncoderTest, Expected
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.protocol import Phase, SafetyStop, State
@@ -136,7 +136,8 @@ def free_pair(mass=0.25):
 def arming_test(cap=12.0, closing=False, q=1e-6, still=1, before=None, known=False):
     """Return a test of two axes with counts of `q` [m], at arming or, with `closing` or `before`, at the end."""
     units, before = Units((q, q), (STEP, STEP), (10**6, 10**6)), () if closing else before
-    return EncoderTest(SafetyLimits((cap, cap)), T, units, (still,) * 2, Expected(free_pair(), known), before=before)
+    axes = CheckedAxes(SafetyLimits((cap, cap)), units, T, (still,) * 2)
+    return EncoderTest(axes, Expected(free_pair(), known), before=before)
 
 
 def test_axes_are_tested_one_after_another():
@@ -501,7 +502,7 @@ def test_noise_is_the_least_range_of_short_windows():
 
 def monitor_of(encoder_step, force_step=STEP, **limits):
     limits = SafetyLimits(**{"cap": (12.0,)} | limits)
-    return EncoderMonitor(limits, T, Units((encoder_step,), (force_step,), (10**6,)), (1,))
+    return EncoderMonitor(CheckedAxes(limits, Units((encoder_step,), (force_step,), (10**6,)), T, (1,)))
 
 
 @pytest.mark.parametrize(("newton", "found"), [(0.5, True), (-0.5, True), (0.2, False)])
@@ -558,7 +559,7 @@ def test_a_saturated_encoder_is_found(scenario, link_couplings, axis, most):
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
     """Force changes above 1 N stop a session after an impulse of 0.1 N s without motion; 0.95 N never does."""
-    monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
+    monitor, applied = EncoderMonitor(CheckedAxes(SafetyLimits((12.0, 12.0)), UNITS, T, (1, 1))), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
 
