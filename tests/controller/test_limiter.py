@@ -73,8 +73,8 @@ def test_two_channels_equal_a_calculation_by_hand():
     e, f = BoxProblem(np.array([[1000.0, -900.0], [-900.0, 1000.0]]), -upper, upper).solve(np.array([[20.0], [5.0]]))
     np.testing.assert_allclose(f[:, 0], LIMITS, rtol=1e-12)
     np.testing.assert_allclose(e[:, 0], [0.038993, 0.034437], rtol=0, atol=5e-7)  # half of the last digit
-    nothing_holds = BoxProblem(np.array([[1000.0, -1000.0], [-1000.0, 1000.0]]), -upper, upper)
-    e, f = nothing_holds.solve(np.array([[20.0], [-20.0]]))
+    ungrounded = BoxProblem(np.array([[1000.0, -1000.0], [-1000.0, 1000.0]]), -upper, upper)
+    e, f = ungrounded.solve(np.array([[20.0], [-20.0]]))
     np.testing.assert_allclose(f[:, 0], [5.657, -5.657], rtol=1e-12)
     np.testing.assert_allclose(e[:, 0], [0, -0.014343], rtol=0, atol=1e-9)
 
@@ -228,7 +228,7 @@ def test_a_slip_makes_its_tick_nonlinear():
 
 
 @pytest.mark.parametrize("i", [0, 1])
-def test_a_wall_and_every_limit_at_once(i):
+def test_all_limits_hold_while_a_wall_pushes(i):
     """If all forces exceed their limits in one tick while a wall pushes, each is sent at its limit."""
     network = Network(WALLED.contacts, WALLED.springs, WALLED.masses, WALLED.walls[i : i + 1])
     limiter = loop_of(network, (0, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0))

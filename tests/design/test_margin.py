@@ -254,7 +254,7 @@ def test_a_map_that_cancels_needs_no_damping():
     B, back = np.array([[1e3, 70.0], [-1e3, -70.0]]), np.linalg.inv(turn)
     F = Lti(turn @ (0.5 * np.eye(2)) @ back, turn @ B, np.ones((2, 2)) @ back, np.zeros((2, 2)), 1e-3)
     F1 = F.dc()
-    assert np.abs(F1 - F1.T).max() > 1e-9 * 1e-12  # 1e-9 of F(1)'s scale, 1e-12 N/m at least, would be refused
+    assert np.abs(F1 - F1.T).max() > 1e-9 * 1e-12  # over 1e-9 of F(1), whose size counts as 1e-12 N/m at least
     requirement = this_environment(F, [1.37, 1.37])
     assert requirement.reason is None
     assert requirement.ratio < 1e-9

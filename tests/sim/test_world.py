@@ -283,7 +283,7 @@ def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
 
 @pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
 def test_contacts_that_give_energy_are_held_back(tmp_path, impedance, gives_J):
-    """Contacts of 0.1 kg hit walls, which with solimp 0.99 and by default give energy; the shell passes at most W0."""
+    """With solimp 0.99 and by default, contacts of 0.1 kg that hit walls give energy; the shell passes at most W0."""
     tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
     walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))
     text = f"""<mujoco><option gravity="0 0 0"/><default><geom solimp="{impedance} 0.001"/></default><worldbody>{walls}
