@@ -42,8 +42,9 @@ def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
     entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, report), *_points(axes, report)]
     for mark in report.marks or ():
-        axes.plot(mark.B, mark.K, "*", color="black", markersize=14, clip_on=False, zorder=5)
-        axes.annotate(f"{mark.K:g}, {mark.B:g}", (mark.B, mark.K), (9, 5), textcoords="offset points", zorder=5)
+        place = max(mark.B, drawn.grid.B[0]), mark.K  # A logarithmic map shows marks with B = 0 on its border.
+        axes.plot(*place, "*", color="black", markersize=14, clip_on=False, zorder=5)
+        axes.annotate(f"{mark.K:g}, {mark.B:g}", place, (9, 5), textcoords="offset points", zorder=5)
     if about_environment:
         entries += _designed_for(axes, drawn, report)
     figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=8.5)

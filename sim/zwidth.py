@@ -282,13 +282,13 @@ class Grid:
         return K.ravel(), B.ravel()
 
     def subset(self, count: int) -> limit_cycles.Cells:
-        """Return flat indices (k,) of the cells in at most `count` rows and columns, which include the corners."""
+        """Return flat indices (k,) of the cells in at most `count` rows and columns, from border to border."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
-    """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
+    """Return a grid of n x n cells. Default ranges follow from the loop and include all marks above 0.
 
     The unit of K is here the sweep's stiffness_scale, and that of B the largest delta. A linear map goes up to 2.5
     units. In a logarithmic map K goes from 1/30 to 30 units, and B from 1/100 to 10 units. Raises InputError for an

@@ -277,6 +277,16 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
     assert figure.get_suptitle() == title
 
 
+def test_logarithmic_maps_show_marks_without_damping(drawn):
+    chart = k_b_map()
+    chart.grid.B, chart.grid.scale = np.array([0.1, 1.0, 2.0]), "log"
+    empty = SimpleNamespace(points=[], effects=map_report().simulation.effects, nonlinear=False)
+    report = map_report(marks=[SimpleNamespace(K=15.0, B=0.0)], simulation=empty)
+    (axis,) = drawn(map_plot.plot_zwidth, chart, report).axes
+    assert [line.get_xydata().tolist() for line in axis.lines if line.get_marker() == "*"] == [[[0.1, 15.0]]]
+    assert [text.get_text() for text in axis.texts] == ["15, 0"]
+
+
 def test_cells_meet_halfway():
     np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 2.0, 4.0]), "linear"), [1, 1.5, 3, 4], rtol=1e-12)
     np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 100.0, 1e4]), "log"), [1, 10, 1e3, 1e4], rtol=1e-12)
