@@ -22,6 +22,7 @@ import numpy as np
 from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
 from haptic_loop.controller.units import in_unit
+from haptic_loop.design.files import lost_output
 from haptic_loop.hw.boards import Boards, ticks_behind
 from haptic_loop.hw.control import Armable
 from haptic_loop.hw.driver import Operator
@@ -30,6 +31,7 @@ from haptic_loop.hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import SafetyStop
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, axis_by_axis
 from haptic_loop.hw.session_report import IncidentLog
@@ -242,7 +244,8 @@ def hold_session(
 ) -> _Held:
     """Run a session from opening the port to its end, or in virtual time; return its signals and lost bytes.
 
-    `emulated` is the scenario of the emulated device; None for that of the options.
+    `emulated` is the scenario of the emulated device; None for that of the options. A device is not armed if the lines
+    before arming cannot be printed. Raises OSError if those before the first message to the device cannot be printed.
     """
     with ExitStack() as stack:
         if args.rehearse:
@@ -274,8 +277,13 @@ def hold_session(
             for path, own in zip(_ports(args), device.ages if isinstance(device, Boards) else (), strict=False):
                 at = {p: round(float(np.percentile(own, p))) for p in (50, 99)}
                 console(args).print(f"{path}: answers are {at[50]} us old, {at[99]} us at the 99th percentile")
-            return plan(ages)
+            programs = plan(ages)
+            if lost_output:
+                raise SafetyStop("standard output cannot be written")
+            return programs
 
+        if lost_output:
+            raise lost_output.pop()
         operator = Operator(args.arm, seconds, _deadman(args.deadman))
         live = Live(session, device, planned, operator, keyboard, watch, args.pace)
         stack.callback(_clear)

@@ -429,7 +429,7 @@ def test_a_pulled_cable_ends_the_session(scenario, link_couplings):
     [
         ([], "either --port PATH or --rehearse"),
         (["--rehearse", "--port", "x"], "either --port PATH or --rehearse"),
-        (["--port", "/dev/null", "--fault", "drop"], "--fault is only with --rehearse"),
+        (["--port", "/dev/null", "--fault", "drop"], "--fault is allowed only with --rehearse"),
         (["--port", "/nowhere", "--arm", "--no-dead-man"], "--port /nowhere"),
         (["--port", "/nowhere", "--arm"], "--deadman key needs a terminal"),
         (["--port", "/nowhere", "--arm", "--no-dead-man", "--deadman", "device"], "--no-dead-man contradicts"),
@@ -488,6 +488,19 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
             assert os.read(master, 1) == b"\x01"
     os.close(master)
     os.close(slave)
+
+
+@pytest.mark.parametrize(("first", "stages"), [([], []), (["--no-preflight"], ["measured", "refused"])])
+def test_lost_lines_refuse_a_session(first, stages, tmp_path):
+    """If the first lines, of the preflight or of the certificate, cannot be printed, no device is armed."""
+    options = ["--arm", "--no-dead-man", "--no-axis-check", "--measure", "60", "--duration", "0.1", "--pace", "0.05"]
+    with emulated("--nobody", "--pace=0.05") as path, open("/dev/full", "w") as full:
+        words = [sys.executable, "-m", "hw.bridge", "--port", path, *options, *first, "--out", str(tmp_path)]
+        ended = subprocess.run(words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert ended.returncode == 2
+    assert ended.stderr.splitlines()[-1] == "error: standard output: No space left on device"
+    _, *entries = map(json.loads, (tmp_path / "incidents.jsonl").read_text().splitlines())
+    assert [entry["stage"] for entry in entries][-2:] == stages
 
 
 def test_too_long_sessions_of_scenarios_are_refused(tmp_path):
