@@ -14,9 +14,9 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; 3 million take a minute or two
+_MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; all runs then take ten minutes
 _LEGEND = (
-    "position: relative rms error; growth: larger error [1/s] of the growth rates with and without coupling",
+    "position: relative rms error; growth: the larger error [1/s] of two growth rates, with and without coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
     "real: simulated seconds per second; *: right, and no setting of its engine is better in speed and both errors",
 )

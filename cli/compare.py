@@ -223,8 +223,9 @@ def _guarantees(report: Comparison) -> render.Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = (
-        f"{damping} (available: {_list(available)} N s/m; at 10 %: the largest requirement when a stiffness, all of "
-        f"them or a mass change by +10 % or -10 %) · {report.scenario}, case {report.case}"
+        f"{damping} (available: {_list(available)} N s/m; at 10 %: the largest requirement after a "
+        f"change by +10 % or -10 % of a stiffness, of all stiffnesses or of a mass) · {report.scenario}, "
+        f"case {report.case}"
     )
     scale = available[0] if alike else 1.0
     cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}

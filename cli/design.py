@@ -84,15 +84,17 @@ def _parser() -> options.Parser:
     varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
-        "fail unless the proof covers limited forces, too; for this-environment, and for known-device with an optimal "
-        "coupling (default: only a spring-damper tries this proof)"
+        "fail unless the proof also covers limited forces; allowed for this-environment, and for known-device with an "
+        "optimal coupling (default: only a spring-damper tries this proof)"
     )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order (Remark 5)")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    _add_optimal_options(parser, "optimal: the force filter of least transparency error (--band: spring-damper, too)")
+    _add_optimal_options(
+        parser, "optimal: the force filter of least transparency error (--band also for spring-damper)"
+    )
     parser.add_output(
         "FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>][-<condition>].json)"
     )
@@ -343,7 +345,7 @@ def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], li
     rows, left_out = render.shortened(rows, _LESS, len(report.price or ()))
     shown = [render.facts(title, rows)]
     if report.price:
-        title = "by this-environment, in the nominal environment / at the worst vertex"
+        title = "required damping (this-environment) and errors, in the nominal environment / at the worst vertex"
         shown.append(render.columns(title, _OVER_RANGES, report.price, left=range(5)))
     return shown, left_out
 

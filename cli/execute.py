@@ -72,7 +72,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None, alo
         code = _cannot(error)
     if lost_output:
         code = _cannot(lost_output[0])
-    # After a Ctrl-C within exec(), which dataclass() calls, Python would end by SIGINT unless exec() runs once more.
+    # If Ctrl-C interrupted an exec() (dataclass() calls it), Python would end by SIGINT; a later exec() prevents this.
     exec("")
     sys.exit(code)
 

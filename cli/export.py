@@ -1,4 +1,4 @@
-"""python -m design.export coupling.json: export a stored coupling, or its discrete process, as C.
+"""python -m design.export coupling.json: export a stored coupling as C, alone or with environment and delays.
 
 The loop is read from the file, so that the exported process is the certified one.
 """
@@ -44,7 +44,7 @@ class _Exported:
     certificate: Verdict = render.figure(
         "certificate", lambda found: "[green]proved[/]" if found.proved else f"[red]none[/]: {found.reason}"
     )
-    multiplications: int = render.figure("one tick", "{} multiplications, without a limiter")
+    multiplications: int = render.figure("one tick", "{} multiplications, not counting the limiter's")
     force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")
@@ -73,11 +73,11 @@ def main(argv: list[str]) -> int:
     forces += " (--force-limit adds the limiter)" if limiter_rho(stored.loop, stored.certificate) is not None else ""
     if block.limiter:
         limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
-        forces = (
-            f"limited to {listed(limits if block.limiter.balls else block.limiter.limit.tolist())} N by the limiter"
-        )
-        if stored.loop.axes:
-            forces += ", the length of each device's vector" if block.limiter.balls else ", axis by axis"
+        limited = "each axis" if stored.loop.axes else "forces"
+        if block.limiter.balls:
+            limited = "the length of each device's force vector"
+        largest = listed(limits if block.limiter.balls else block.limiter.limit.tolist())
+        forces = f"the limiter keeps {limited} within {largest} N"
     exported = _Exported(
         block.name,
         block.system.order,
@@ -125,7 +125,7 @@ def _parser() -> options.Parser:
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
-    """Return the block to export, with comment lines on its source. Raises InputError if file or options allow none."""
+    """Return the block, with comment lines on its file and proof. Raises InputError if file or options do not fit."""
     limit, balls = _force_limits(args.force_limit, stored.loop) if args.force_limit else (None, ())
     try:
         block = process_block(stored, not args.without_theta, limit, balls) if args.process else coupling_block(stored)

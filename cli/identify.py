@@ -304,7 +304,7 @@ def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
         least, most = each.transmission_damping_min, each.transmission_damping_max
         mass, stiffness = f"{each.motor_mass_min:.5g}", f"{each.transmission_stiffness_max:.6g}"
         cells.append((str(i), mass, stiffness, f"{least:.4g} to {most:.4g}", f"{1e6 * each.late:.0f}"))
-    heads = "axis", "motor at least [kg]", "k at most [N/m]", "b [N s/m]", "late at most [us]"
+    heads = "axis", "motor at least [kg]", "k at most [N/m]", "b [N s/m]", "force late at most [us]"
     return render.grid("motor and transmission, with 95 % confidence", heads, cells, left=())
 
 

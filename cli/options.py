@@ -115,7 +115,7 @@ class Parser(argparse.ArgumentParser):
             for name in names if not acts(parsed) else ():
                 if getattr(parsed, name) != self.get_default(name):
                     option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
-                    raise InputError(f"{option} is only {where}")
+                    raise InputError(f"{option} is allowed only {where}")
         if getattr(parsed, "json", None) not in (None, "-"):
             check_file("--json", Path(parsed.json), "a file or -")
         return parsed, rest
@@ -142,7 +142,7 @@ class Parser(argparse.ArgumentParser):
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)
-        paper = "the paper's cases: I and II choose --reference, none is --coupling none"
+        paper = "short names: I and II mean --reference I and II, none means --coupling none"
         loop.add_argument("--case", choices=CASES, help=paper)
         names = ", ".join(built_in())
         loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"a file, or one of: {names}")
@@ -158,8 +158,9 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
         longest = (
-            "longest period [s], if periods vary: certificates cover all periods up to it (known-device: from T_min on)"
+            "longest period [s], if periods vary: certificates cover all up to it (known-device: from the scenario's "
         )
+        longest += "T_min up to it)"
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
         known = (
             "guaranteed bounds: least motor mass [kg], and largest stiffness [N/m], least damping and largest damping "
@@ -172,7 +173,8 @@ class Parser(argparse.ArgumentParser):
             metavar="MASS,K_MAX,B_MIN,B_MAX",
             help=f"{known}; once for all devices, or once per device",
         )
-        late = "time from tick to latch of a force [s], below T: LO:HI, or S for 0:S; one for all, or one per device"
+        late = "time [s] from a tick until the device applies its force, below T: LO:HI, or S for 0:S; one for all or "
+        late += "one per device"
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
@@ -224,7 +226,7 @@ class Parser(argparse.ArgumentParser):
         loss = "probability that a force is lost; the device then holds the last force"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)
         group.add_argument("--playout", action="store_true", help="a buffer that gives every force the largest delay")
-        alike = "without --playout: a playout buffer gives every force the largest delay"
+        alike = "as a FILE with --playout: the buffer gives every force the largest delay"
         self.only(alike, lambda args: not args.playout or args.pattern not in _DRAWN, "pattern")
 
     def add_output(
@@ -393,8 +395,8 @@ def given(value: Any) -> bool:
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
     """Turn a ValueError or ArithmeticError into InputError, with `name` in front of its message.
 
-    DesignFailed and errors raised in a user's own class pass. If the message begins with the name of an argument in
-    `args`, the option's name replaces it.
+    InputError, DesignFailed and errors raised in a user's own code are raised again unchanged. If the message begins
+    with the name of an argument in `args`, the option's name replaces it.
     """
     try:
         yield
@@ -434,7 +436,7 @@ def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> De
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
-    """Parse `count` numbers; a single number is repeated. `option` is named in the InputError that it raises."""
+    """Parse `count` numbers; a single number is repeated. Raises InputError, whose message names `option`."""
     try:
         if count == 1 and "," not in text:
             return (_one(kind)(text),)
@@ -489,7 +491,7 @@ def in_world(scenario: Scenario, file: str) -> Scenario:
     if len(bodies) != scenario.channels:
         listed = f"{len(bodies)} named bodies without a joint ({', '.join(bodies) or 'none'})"
         need = f"{scenario.name} has {scenario.channels} contact{'s' if scenario.channels > 1 else ''}"
-        raise InputError(f"--world {file} has {listed}, {need}: name contacts in a scenario, as in world-cube")
+        raise InputError(f"--world {file} has {listed}, but {need}: name contacts in a scenario, as in world-cube")
     return scenario.replace(environment=world_environment({"world": str(Path(file).resolve()), "contacts": bodies}))
 
 

@@ -6,8 +6,9 @@
     ..
     painter.save(path)                       # writes the picture
 
-The second process sends the picture back and writes no file. It ends when the first process ends, because its standard
-input is then closed. If it cannot start, or ends without a picture, the first process draws.
+The second process sends the picture back and writes no file. If the first process ends before `ask`, the second ends,
+too, because its standard input is closed without a request. If the second cannot start, or ends without a picture, the
+first process draws.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def _started() -> subprocess.Popen[bytes] | None:
 
 
 class Painter:
-    """Draws one picture in the second process of `begin`, or in a new one if `wanted`; else in this process."""
+    """Draws one picture: in the process that `begin` started, else in a new one (if `wanted`), else in this process."""
 
     def __init__(self, wanted: bool = True) -> None:
         global _begun

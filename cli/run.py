@@ -138,7 +138,7 @@ def _require_papers(args: argparse.Namespace, scenario: Scenario) -> None:
     from haptic_loop.sim.report import is_papers
 
     if not is_papers(scenario, args.case):
-        raise InputError("--paper: the paper prints figures of its own loop only; leave the loop as it is")
+        raise InputError("--paper: the paper prints figures of its own loop only; leave out options that change it")
 
 
 def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:

@@ -16,7 +16,7 @@ from haptic_loop.design.files import discard_output, lost_output, printable
 _CUT = "…"  # rich's mark for a cut word
 _WIDEST = 400  # [characters] largest width of a table
 _STEP = 2  # characters by which the width grows
-_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # "[" that does not begin a tag of rich
+_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # "[" that does not begin one of our reports' tags
 
 
 def _in_unit(shown: Any) -> Any:
@@ -30,7 +30,7 @@ def _in_unit(shown: Any) -> Any:
 
 
 class Screen(Console):
-    """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
+    """A console that makes tables wider than the terminal (up to _WIDEST) instead of cutting a cell."""
 
     def print(self, *objects: Any, **how: Any) -> None:
         """Print as rich does, but widen the console up to _WIDEST, so that no table loses a character.

@@ -186,7 +186,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
     worst: list[Worst] = []
     try:
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
-            with render.progress("searching the worst human") as move:
+            with render.progress("searching for the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
                 # Among all sets of touched walls take the one that requires most damping.

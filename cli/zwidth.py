@@ -44,7 +44,9 @@ def main(argv: list[str]) -> int:
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
     if args.case == "II" and of_coupling:
-        raise InputError("--case II is only with --coupling: a map of spring-dampers is compared with no reference")
+        raise InputError(
+            "--case II is allowed only with --coupling: a map of spring-dampers is compared with no reference"
+        )
     chosen = chosen_by(args, scenario) if args.coupling else None
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -110,7 +112,7 @@ def _parser() -> options.Parser:
     )
     parser.add_output(picture=True)
     parser.set_defaults(limiter=None)  # There is no --no-limiter, because the simulated motors never clip.
-    parser.only("about simulated points: --points 0 has none", lambda args: args.points, "duration")
+    parser.only("with simulated points: --points 0 has none", lambda args: args.points, "duration")
     designed = "with --coupling, or for a condition of your own"
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the map varies the environment"

@@ -1,6 +1,6 @@
 """Is a hand-picked coupling safe for every passive human? If not, by which factor must its gains shrink?
 
-The loop is the paper's: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
+The loop is that of the paper which README.md names: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
 """
 
 from haptic_loop import SpringDamper, certify, load

@@ -1,7 +1,8 @@
-"""Touch a recurrent network of random neurons: it has no model and no proof, and yet hands are safe.
+"""Touch a recurrent network of random neurons: it has no model, and yet the energy given to hands is bounded by proof.
 
 The network is behind a coupling certified for any passive environment. A shell makes the network passive: it scales the
-forces so that they never give more energy than the budget. A physics engine can replace the network.
+forces so that they never give more than the budget beyond the energy that they took. A physics engine can replace the
+network.
 """
 
 import sys

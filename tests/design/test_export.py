@@ -231,7 +231,7 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
     folder = limited_files[0]
     with pytest.raises(InputError, match="the certificate covers no limited forces"):
         main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
-    with pytest.raises(InputError, match="--force-limit is only with --process"):
+    with pytest.raises(InputError, match="--force-limit is allowed only with --process"):
         main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
 
 
@@ -452,7 +452,7 @@ def test_a_hostile_name_stays_inside_the_comment(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["{gains}", "--without-theta"], "--without-theta is only with --process"),
+        (["{gains}", "--without-theta"], "--without-theta is allowed only with --process"),
         (["{gains}", "--out", "{gains}"], "name another file"),
         (["{gains}", "--out", "{place}"], "is a folder"),
         (["{gains}", "--seed", "1"], "unknown option --seed"),

@@ -1,4 +1,4 @@
-"""Tests of the moving average, the stiffest coupling for any environment: its zeros, its design and its file."""
+"""Tests of the moving average, almost the stiffest linear coupling for any environment: zeros, design and file."""
 
 import numpy as np
 import pytest
@@ -16,14 +16,14 @@ T = 1e-3
 
 
 def window(theta, delta, factor=1.0):
-    """Return factor T/(2 delta) (1 + ... + z^-theta), a moving average without the design's constant e."""
+    """Return factor T/(2 delta) (1 + ... + z^-theta), a moving average without the constant that the design adds."""
     return taps([factor * T / (2 * delta)] * (theta + 1), T)
 
 
 @pytest.mark.parametrize("theta", range(5))
 @pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.5])
 def test_scaled_moving_averages_need_inversely_scaled_damping(theta, factor):
-    """V and the window share their zeros, where no damping is required. The ratio is 1/factor elsewhere."""
+    """V and Theta-hat vanish at the same frequencies, where no damping is required. Elsewhere the ratio is 1/factor."""
     needs = any_environment(window(theta, 1.3, factor), [theta], [1.3])
     assert needs.reason is None
     assert needs.ratio == pytest.approx(1 / factor, rel=1e-5)
@@ -31,7 +31,7 @@ def test_scaled_moving_averages_need_inversely_scaled_damping(theta, factor):
 
 
 def test_channels_with_different_zeros_need_one_ratio():
-    """The ratio is 1/1.02. With three channels the permutation of singular vectors is not its own inverse."""
+    """The ratio is 1/1.02. Three channels also catch a matrix of singular vectors swapped with its transpose."""
     theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
     for m in (2, 3):
         V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])
@@ -52,7 +52,7 @@ def test_moving_averages_beat_spring_dampers(name, case):
     assert isinstance(stiff.coupling, MovingAverage)
     assert isinstance(soft.coupling, SpringDamper)
     assert (stiff.coupling.stiffness < limit).all()
-    np.testing.assert_allclose(stiff.coupling.stiffness, limit, rtol=1e-3)  # the constant e costs 1e-4 n
+    np.testing.assert_allclose(stiff.coupling.stiffness, limit, rtol=1e-3)  # the constant costs 1e-4 (theta + 1)
     assert (stiff.coupling.stiffness > soft.coupling.K).all()
     better, worse = (decibels(transparency_of(loop, each).rms_mismatch) for each in (stiff, soft))
     assert better < worse - 0.5

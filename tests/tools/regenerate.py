@@ -8,7 +8,7 @@ the pages (`same_line`). The exit code is 1 if they differ or if a command fails
     $ python -m design.audit ..
     ```
 
-    <!-- measured: RK4 x 4 -->            the same for a command that is slow or prints times
+    <!-- measured: RK4 x 4 -->            lines of a command that is slow or prints times, by such an expression
     ```text
     $ python -m sim.accuracy
 
@@ -101,7 +101,7 @@ _ROUNDING = 1e-6  # smaller errors may be rounding, which depends on the machine
 def same_line(shown: str, line: str, measured: bool = False) -> bool:
     """Return whether words are equal, and numbers differ by at most 2 units in the last place shown or by 0.2 %.
 
-    In measured output times do not count, and errors (`1.2e-05`) may differ by a factor of two or be below 1e-6.
+    In measured output, times are ignored, and errors (`1.2e-05`) may differ by a factor of two or be below 1e-6.
     """
     if measured:
         shown, line = _TIMES.sub("", shown), _TIMES.sub("", line)
