@@ -210,7 +210,7 @@ def _columns(shape: tuple[int, int], starts: Any, rows: Any, values: Array) -> A
 # the second-order term dZ dS (Mehrotra). The start may be infeasible.
 
 _GAP = 1e-8  # The iteration ends if the relative gap and the violation are below this.
-_ENOUGH = 1e-6  # The best point counts as solved below this error. If the error grows by 1/_ENOUGH, the iteration ends.
+_ENOUGH = 1e-6  # The best point counts as solved below this error. An error above the least/_ENOUGH ends the iteration.
 _KEPT = 0.98  # length of a step, relative to the distance to the boundary
 _SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by a step towards S Z = _CENTRING mu I.
 

@@ -117,8 +117,8 @@ def design_by_kind(
             condition.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
-            forces if LIMITER has designs for the loop and a search finds one; with `limiter` True the design fails
-            otherwise. `switching` replaces loop.varying_delay.
+            forces if LIMITER has designs for the loop and a search finds one. Otherwise a design with `limiter` True
+            fails. `switching` replaces loop.varying_delay.
 
     Raises:
         ValueError: The kind or condition does not exist, or it is not suitable for the loop.
@@ -148,7 +148,7 @@ def design_by_kind(
 def _designed(
     loop: Loop, kind: str, condition: Condition, own: Condition | None, progress: _Progress, options: dict[str, Any]
 ) -> Design:
-    """Return the coupling that is designed by `condition`. It also satisfies `own`, the user's condition, unless None.
+    """Return the coupling that is designed by `condition`. It also satisfies the user's condition `own`, if any.
 
     Raises the errors of `design_by_kind`.
     """

@@ -327,12 +327,12 @@ class _Search:
         return float(np.hypot(self.mismatch(candidate), static))
 
     def gained(self, before: Optimal | None, candidate: Optimal) -> float:
-        """Return how much less the merit is than that of the coupling `before` [dB]; infinity if `before` is None."""
+        """Return by how many dB the merit of `candidate` is below that of `before`; infinity if `before` is None."""
         return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(candidate))
 
     @property
     def simple(self) -> float:
-        """The largest kappa for which R = kappa I satisfies this-environment with MARGIN unused, or 1 if all do."""
+        """The largest kappa for which R = kappa I meets this-environment with MARGIN unused; 1 if every kappa does."""
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:

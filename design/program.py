@@ -66,7 +66,7 @@ _DECIMALS = 10  # decimal places of g and of R's coefficients
 # less, to the difference between the objectives of zero force and of the solution.
 _GAPS = (0.05, 0.01)
 # Allowed violation of an inequality between the frequencies of its grid. The first number holds if the caller scales
-# the forces down. The second holds for `_kept`, which loses 30 times as much.
+# the forces down. The second holds for `_kept`, which worsens the objective 30 times as much.
 _FORGIVEN, _FORGIVEN_OF_MORE = 5e-4, 1e-4
 _STEEPER = 3.0  # factor between successive t of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency

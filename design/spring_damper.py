@@ -518,7 +518,7 @@ def _starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-# With this e of `moving_average`, ringing of the force decays per tick by 0.5 (theta = 1) or 0.55 (theta = 2).
+# With this e of `moving_average`, a ringing force decays by the factor 0.5 (theta = 1) or 0.55 (theta = 2) per tick.
 _SPARE_OF_SLOW_WORLDS = 0.25
 
 
