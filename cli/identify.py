@@ -319,6 +319,6 @@ def _figures(report: _Report) -> render.Table:
         cells.append((str(i), *figures, mode, bound, f"{math.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
     heads = (
         *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),
-        "up to [m/s]",
+        "at speeds up to [m/s]",
     )
     return render.grid(f"{report.session.scenario}, identified", heads, cells, left=())

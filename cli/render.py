@@ -311,7 +311,7 @@ _MUCH = 2.0  # ratio of required to available damping in nearby environments, ab
 def robustness_rows(there: Robustness | None) -> Rows:
     """Yield rows on the damping that is required if the environment's model is wrong."""
     if there:
-        words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
+        words = f"needs {there.required_over_available:.3f} times the damping at {there.where}"
         yield "robustness", f"{words}, the worst of the tried changes by {there.percent:g} %"
         if there.required_over_available > _MUCH:
             yield "", f"python -m design --ranges {there.percent:g}% designs for all of these environments"

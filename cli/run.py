@@ -281,7 +281,8 @@ def _details(report: RunReport) -> list[str]:
 
 def _speed(run: Ran) -> str:
     engine = run.engine + (f" {run.integrator} x {run.substeps}" if run.integrator else "")
-    return f"{run.wall_s:.2f} s for {run.duration_s:g} s: {run.real_time_factor:.2g} x real time ({engine})"
+    pace = float(f"{run.real_time_factor:.2g}")
+    return f"{run.wall_s:.2f} s for {run.duration_s:g} s: {pace:g} x real time ({engine})"
 
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:

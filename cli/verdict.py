@@ -65,7 +65,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
         return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}"
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
-    felt = f": {_percent(share)} of the stiffness" if share else ""
+    felt = f": {_percent(share)} of the stiffness is rendered" if share else ""
     by = f" by the condition {guarantee.own}, which is your own," if guarantee.own else ""
     words = [f"[green]Stable[/]{by} for {_who(guarantee)}{felt}."]
     if not assessment.holds:
@@ -100,14 +100,14 @@ def lost(assessment: Assessment, nearby: Robustness | None) -> str:
     guarantee = assessment.guarantee
     if nearby is None or nearby.certified or guarantee is None or guarantee.any_environment:
         return ""
-    return f"Lost with {nearby.where}."
+    return f"The guarantee is lost with {nearby.where}."
 
 
 def _who(guarantee: Guarantee) -> str:
     """Return the hands and objects of a guarantee, such as "every passive hand with this object"."""
     place = _OBJECTS.get(guarantee.environments, guarantee.environments)
     if guarantee.environments == RANGES:
-        place = f"{guarantee.vertices} of the ranges (only searched between vertices)"
+        place = f"the object at {guarantee.vertices} of the ranges (only searched between vertices)"
     delays, facts = guarantee.delays, guarantee.facts
     late = f", with delays that switch within {delays}" if "switching" in facts else ""
     return f"{guarantee.hands} with {place}{late}"
@@ -160,7 +160,7 @@ def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
     part, count = ranges.part(), len(ranges.members) - 1
     member, requirement = ranges.worst
     exact = ranges.certificate is not None
-    ratio = f"{requirement.ratio:.4f} of the damping" if math.isfinite(requirement.ratio) else _NEVER
+    ratio = f"needs {requirement.ratio:.4f} times the damping" if math.isfinite(requirement.ratio) else _NEVER
     proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {ranges.reason}"
     of = "" if ranges.where == "every vertex" else f"; {ranges.where}"
     yield "ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"
@@ -168,8 +168,8 @@ def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
     yield "ranges, between", str(part["search"])
     inside = part["inside"]
     if inside["worst_ratio"] is not None:
-        most = f"at most {inside['worst_ratio']:.4f} of the damping" if math.isfinite(inside["worst_ratio"]) else _NEVER
-        drawn = f"{inside['certified']} of {inside['samples']} random samples certified, {most}"
-        yield "ranges, inside", drawn
+        worst = inside["worst_ratio"]
+        most = f"the worst needs {worst:.4f} times the damping" if math.isfinite(worst) else _NEVER
+        yield "ranges, inside", f"{inside['certified']} of {inside['samples']} random samples certified, {most}"
     if exact and not ranges.proved:
         yield "ranges", f"[red]not guaranteed[/]: {ranges.reason}"

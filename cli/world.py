@@ -114,7 +114,7 @@ def _common_rows(report: _Report) -> Iterator[tuple[str, str | None]]:
         values = report.coupling.get(name)
         if isinstance(values, list) and values:
             yield f"coupling, {name}", f"{listed(values, 5)} {unit}"
-    yield "any environment", f"{needs.amounts()}: {render.certified(needs)}"
+    yield "damping, any-environment", f"{needs.words()}: {render.certified(needs)}"
     yield "held torques", report.assessment.held_torques
 
 

@@ -93,7 +93,8 @@ def _parser() -> options.Parser:
     names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
     parser.add_condition(
-        "with --coupling: condition to design for (default: the coupling's); your own is drawn in every map", to=of_map
+        "condition to design for, with --coupling (default: the coupling's); one of your own is drawn in every map",
+        to=of_map,
     )
     rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
