@@ -1,12 +1,12 @@
-"""Validate a loop with many random passive humans, by two engines, in batches that several processes may share.
+"""Validate a loop with many random passive humans, by two engines, in batches that can run in several processes.
 
 A set has one human for each device. The humans of set i depend on the scenario, the seed and the number of links, and
 not on other sets. The batches, and therefore the findings, do not depend on the number of processes.
 
 The first engine is the exact one, which simulates all sets. The second engine is MuJoCo or a user's own, and simulates
 all sets or a sample (`_witnessed`). MuJoCo's verdict comes from the map of its RK4 integrator over one period, the
-period map. Both engines share the model, but the period map uses no other result of the exact engine. MuJoCo's traces
-use the exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4.
+period map. Both engines share the model, but the period map uses nothing that the exact engine computes.
+MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4.
 """
 
 from __future__ import annotations
@@ -139,8 +139,9 @@ class Validation:
 class Findings:
     """The results for every set of humans, sorted by index.
 
-    Figures are nan and counts 0 without the engine or the trace that they need. W(N) [J] is the work of the forces plus
-    the least dissipation of the devices, up to tick N.
+    Figures are nan and counts 0 without the engine or the trace that they need. W(N) [J] is the energy that the devices
+    give to the controller up to tick N (sum of f'dx), plus their least dissipation. With walls, `radius`, `exact`,
+    `frequency` and `mujoco` are those for the set of touched walls with the fastest growth.
 
     Attributes:
         index: (n,) number of each set. With the seed, it determines the humans of the set.
@@ -162,9 +163,9 @@ class Findings:
         switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
         switching_mujoco: (n,) growth rate [1/s] of the second engine under the same delays or ticks; nan also if a
             force of its trace is clipped.
-        simulated: The duration of all traces together [s].
+        simulated: Simulated time of all impulse tests [s], without the traces under varying delays or ticks.
         interrupted: Whether the keyboard interrupted the validation.
-        lost: The reason why batches are missing although the keyboard did not interrupt, or "".
+        lost: The reason for missing batches, other than Ctrl-C, or "".
     """
 
     index: NDArray[np.intp]
@@ -194,7 +195,7 @@ class Findings:
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
-        """(n,) whether the engines contradict each other: by `mujoco`, by `trace` if it decides, or by `switching`."""
+        """(n,) whether `exact` contradicts `mujoco` or a decisive `trace`, or the two switching rates disagree."""
         switching = disagree(self.switching, self.switching_mujoco)
         trace = np.where(self.trace_decides, self.trace, np.nan)
         return disagree(self.exact, self.mujoco) | disagree(self.exact, trace) | switching
@@ -319,7 +320,7 @@ def _other_engine(
 
 
 def _dominant(plants: HeldPlant, frozen: Iterable[Lti]) -> Mode:
-    """Return the dominant mode of each plant, with that force map of `frozen` with which the plant grows fastest."""
+    """Return each plant's dominant mode in the loop with the force map of `frozen` that gives the fastest growth."""
     return Mode.worst([dominant_mode(close(plants, F)) for F in frozen])
 
 
@@ -364,7 +365,7 @@ def _traced(
 ) -> ImpulseTest:
     """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are the second engine's.
 
-    Periods are constant here, and forces latch in the middle of their range. `switched_crowd` varies both.
+    Here periods are constant, and each force latches at the middle of its range; `switched_crowd` varies these times.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks

@@ -7,8 +7,8 @@ from scipy.linalg import expm
 class Hands:
     """Devices in random passive hands, integrated by the matrix exponential.
 
-    `lossless` and `start`, the scale of the initial velocities [m/s], are one value or (nsim,). `masses` is the number
-    of masses; the first of them are the devices, with damping `delta` [N s/m].
+    `lossless` (only the devices dissipate) and `start` (scale of the initial velocities [m/s]) are scalars or (nsim,).
+    `masses` is the number of masses; the first of them are the devices, with damping `delta` [N s/m].
     """
 
     def __init__(self, rng, nsim, lossless, start=0.0, masses=None, T=1.2e-3, delta=(1.37, 0.9)):

@@ -1,9 +1,9 @@
 """The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
 When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities; in a world it
-restarts from rest. The controller starts a new process, F with states z, at its equilibrium z = A z + B x for these
-positions x, without contact. The delay lines of the new process hold the static force, which is F(1) x if no limiter
-acts. So the force changes to that of the new coupling, and the environment's masses lose their motion.
+restarts from rest. The new controller starts in its steady state for these positions x, with no wall touched. Its delay
+lines hold the static force, which is F(1) x if no limiter acts. So the force changes to that of the new coupling, and
+the environment's masses lose their motion.
 
 The mouse is a hand: a spring from the handle to the dragged point, and a damper from the handle to the ground. This
 hand is part of the exact plant and passive, so a certificate for every passive human covers it. Only the end of the
@@ -83,7 +83,7 @@ class _Restart:
 
 _Event = Couple | _Delay | _Push | _Restart
 
-#: GLFW's code -> (name, event) of keys that MuJoCo's viewer does not use (it uses 0 to 5 and the letters)
+#: GLFW's code -> (name, event) of keys; 0 to 5 and the letters are left to MuJoCo's viewer
 KEYS: dict[int, tuple[str, _Event]] = {
     ord("6"): ("6", Couple("none")),
     ord("7"): ("7", Couple("published")),
@@ -180,7 +180,7 @@ class PreparedLoop:
     label: str  # name of the coupling in scripts
     chosen: Chosen
     simulation: Simulation
-    mode: Mode | None  # dominant mode of the exact loop; with walls, of the worst frozen loop; None for a world
+    mode: Mode | None  # dominant mode of the exact loop; with walls, of the worst set of touched walls; None in a world
     assessment: Assessment
 
     @property
@@ -264,7 +264,7 @@ class _Pace:
         return ticks
 
     def factor(self, now: float) -> float:
-        """Return simulated time over clock time, which is 1 if no time was lost."""
+        """Return simulated time over clock time, which approaches 1 if no time was lost."""
         return self.done * self.T / now if now > self.T else 1.0
 
 
@@ -310,8 +310,8 @@ class Frame:
     mean: Array  # (m,) mean force fed back since the last frame [N]
     low: Array  # (m,) least force since the last frame [N]
     high: Array  # (m,) largest force since the last frame [N]
-    at_limit: NDArray[np.bool_]  # (m,) whether a force since the last frame was at the limit of its axis or vector
-    push: Array  # (m,) force of the mouse or the script on each handle [N]
+    at_limit: NDArray[np.bool_]  # (m,) whether its force or its device's vector reached a limit since the last frame
+    push: Array  # (m,) sum of the mouse's and the script's forces on each handle [N]
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks in `history` in which some force is at its limit (controller.tick.at_limit)
     prepared: PreparedLoop
@@ -415,7 +415,7 @@ class LiveLoop:
                 self._happen(event)
 
     def _make(self, event: Couple | _Delay) -> PreparedLoop | str:
-        """Return the loop after an event, or the reason why the event is refused. The executor runs one at a time."""
+        """Return the loop after an event, or why it is refused. `_latest` requires an executor with one worker."""
         try:
             self._latest = _changed(self._latest, event)
         except (InputError, DesignFailed, SingularLoop) as error:  # The old loop goes on.

@@ -58,7 +58,7 @@ _ALARM: _Colour = (1.0, 0.15, 0.15)  # a force at its limit
 
 _LONGEST = 0.12  # [m] length of the arrow of a force at its limit, except in a world
 _SIZE = (640, 640)  # pixels of a video
-_WORDS = 0.40  # least share of a video's height for the text at the top
+_WORDS = 0.40  # least share of a video's height for the text at the top, except in a world
 _PLOT = 0.25  # share of the picture's height for the forces at the bottom
 _WIDTH = 60  # characters in a line of the note on the last event
 _COLUMNS = 250  # number of time spans in a plot of forces; each has a line from its least to its largest force
@@ -146,14 +146,14 @@ def _limited(prepared: PreparedLoop) -> str:
     assessment = prepared.assessment
     if assessment.guarantee is None:
         return "no guarantee"
-    return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee holds there, too"
+    return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee still holds"
 
 
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
     """Return the row of the energy shell of a world: its label, and its figures in words."""
     W0, given_mJ, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
     most = (
-        f"gave {given_mJ:.2f} of at most {W0:g} (W0) + {released:.1f} (released) mJ"
+        f"devices got {given_mJ:.2f} of at most {W0:g} (W0) + {released:.1f} (released) mJ"
         if prepared.assessment.guarantee
         else "no guarantee"
     )
@@ -347,7 +347,7 @@ def _dressed(scene: Scene) -> mujoco.MjModel:
     deepest, channels = max(1, *where), _channels(scene)
     middle = [(deepest - 1) * STEP / 2, -APART * (len(channels) - 1) / 2, 0.03]
     for device, own in enumerate(channels):
-        if len(own) > 1:  # A device that moves in space needs no rail.
+        if len(own) > 1:  # A device with several axes needs no rail.
             continue
         at, rail = [middle[0], -APART * device, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
@@ -449,7 +449,7 @@ def show(session: LiveLoop, stage: _ShownScene, until: float | None = None) -> N
         raise InputError(f"no window can be opened: there is no display, or none with OpenGL; {instead}")
     threads = set(threading.enumerate())
     try:
-        from mujoco import viewer  # needs the library of a display
+        from mujoco import viewer  # imports GLFW, which only a window needs
 
         window = viewer.launch_passive(
             stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
@@ -521,7 +521,7 @@ _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
 
 class _FlatPictures:
-    """Pictures of a film by Pillow: the scene from above, and the forces. A body grows when it moves along z."""
+    """Pictures of a film by Pillow: the scene from above (a body grows with its height z), and the forces."""
 
     def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
         self.scene, self.force_limit, self.object = scene, force_limit, drawn

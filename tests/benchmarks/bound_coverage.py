@@ -5,7 +5,7 @@ PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some min
 Every case draws a device from its own seed; every fourth is compliant, the others are rigid. Mass is 0.1 to 0.5 kg,
 viscous friction 0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (0 in a fifth of the cases). Encoder steps are 1 to 20 um
 with a random origin; half of the cases have white noise of 0.2 or 0.4 steps. The excitation is that of hw.identify,
-without its swing.
+without the swing and the sweep with the swing's force.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import load
 from tests.sessions import RubbingPlant
 
-FORCE_STEP = 4e-4  # [N] to which the protocol rounds forces
+FORCE_STEP = 4e-4  # [N] force step of the simulated device
 NOISE = (0.0, 0.0, 0.2, 0.4)  # [encoder steps]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A device, its encoder, and the length of the record."""
+    """A device, its encoder, and the duration of a sweep."""
 
     seed: int
     rigid: bool
@@ -42,7 +42,7 @@ class Case:
     coulomb: float  # [N]
     step: float  # [m]
     noise: float  # [steps]
-    seconds: float = 2.5  # duration of the chirp
+    seconds: float = 2.5  # duration of each of the three sweeps
 
 
 def case(seed: int) -> Case:
@@ -108,8 +108,8 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
         off = 100 * (estimate.viscous / c.viscous - 1)
         print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
     over = sum(e > 0 for e in excess)
-    print(f"{len(excess)} bounds, {over} above the truth, the worst by {max(excess):+.3f} %; no bound in {none} cases")
-    print(f"bounds below the truth: median {-np.median(excess):.2f} %, most {-min(excess):.2f} %")
+    print(f"{len(excess)} bounds, {over} above the truth; no bound in {none} cases; bound less truth:")
+    print(f"largest {max(excess):+.3f} %, median {np.median(excess):+.2f} %, least {min(excess):+.2f} %")
     print(f"errors over standard errors: mean {np.mean(scaled):+.2f}, deviation {np.std(scaled):.2f}")
     print(f"longest case {longest:.1f} s")
 

@@ -2,13 +2,15 @@
 
 PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (pip install drake control)
 
-Every tool simulates the default scenario with the published coupling of case I. Process, force limits, external forces
-and plant are the same. The tools alternate, and the median of a tool's CPU times counts. Growth is measured on the
-tool's trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1".
+Every tool simulates the default scenario with the published coupling of case I. Process, plant and external forces are
+the same; so are the force limits, except in scipy.signal. The tools alternate, and the median of a tool's CPU times
+counts. Growth is measured on the tool's trace, projected on the exact loop's dominant mode. `ratio` is the CPU time
+over that of "exponential x 1".
 
-Drake simulates a MultibodyPlant of prismatic joints, with springs as bushings. Forces are applied as generalised
-forces, because discrete controllers in Python slow Drake down. python-control simulates the sampled plant as a
-nonlinear discrete system, because linear systems cannot clip. scipy.signal simulates the closed loop without clipping.
+Drake simulates a MultibodyPlant of prismatic joints; bushings replace the tendons between two bodies. The process runs
+outside Drake and sets generalised forces at each tick, because Drake is slow with controllers in Python. python-control
+simulates the sampled plant as a nonlinear discrete system, because linear systems cannot clip. scipy.signal simulates
+the closed loop without clipping.
 """
 
 from __future__ import annotations

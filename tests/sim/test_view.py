@@ -408,11 +408,11 @@ def test_the_overlay_says_what_limits_and_shells_do():
         return SimpleNamespace(assessment=SimpleNamespace(guarantee=guarantee, force_limits=SimpleNamespace(rho=rho)))
 
     covered, clipped, none = prepared("here", (0.0,)), prepared("here", None), prepared(None, (0.0,))
-    assert _limited(covered) == "limited: the guarantee holds there, too"
+    assert _limited(covered) == "limited: the guarantee still holds"
     assert (_limited(clipped), _limited(none)) == ("clipped: not covered", "no guarantee")
     shell = SimpleNamespace(start_J=2e-3, given_J=1.5e-3, released_J=0.1, limited_ticks=3, ticks=500)
-    acted = "acted on 3 of 500 ticks, "
-    assert _account(shell, covered) == ("energy shell", f"{acted}gave 1.50 of at most 2 (W0) + 100.0 (released) mJ")
+    acted, most = "acted on 3 of 500 ticks, ", "devices got 1.50 of at most 2 (W0) + 100.0 (released) mJ"
+    assert _account(shell, covered) == ("energy shell", acted + most)
     assert _account(shell, none)[1] == f"{acted}no guarantee"
 
 
