@@ -34,7 +34,7 @@ class Coupling:
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear model of the environment
+    holds_model: ClassVar[bool] = False  # whether the coupling filters the forces of a linear model of the environment
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
@@ -412,7 +412,7 @@ class ForceFilter(ReadOnly, Coupling):
                 Sampled(environment.z, np.tensordot(values, _own_columns(self.R), axes=1), environment.T) @ environment
             )
         if further:
-            raise ValueError("the linear model inside the coupling cannot include the walls of the environment")
+            raise ValueError("a force filter needs a linear environment: for walls take a coupling with a V")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         F = self.filter(environment.T) @ environment
@@ -458,7 +458,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
 
     Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The chain for
     the sum of all inputs needs few states of its own: up to the length of the shortest input's chain, its states are
-    sums of the states of the inputs' chains. Only its states beyond this length are added.
+    sums of the states of the inputs' chains. Only the states beyond this length become new states of the block.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size

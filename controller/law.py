@@ -213,15 +213,15 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The limiter subtracts a slip e (e_- at the previous tick) from x, the input of the map G to the forces f_e before
-# Theta (docs/theory.md, (h)). A stiffness rho >= 0 resists changes of e. With the limits L_i
+# The limiter subtracts a slip e (e_- at the previous tick) from x. The map G from x gives the forces f_e before Theta
+# (docs/theory.md, (h)). A stiffness rho >= 0 resists changes of e. With the limits L_i
 #
 #         f_e = G (x - e) - rho (e - e_-),      |f_e,i| <= L_i,      e_i f_e,i = L_i |e_i|.
 #
 # While no force reaches its limit, e = 0. Let f_free be f_e for e = 0 at this tick (earlier slips included), and D_G
 # the feedthrough of G. The limiter solves f_e = f_free - (D_G + rho) e with e in the normal cone of the box at f_e,
-# together with the walls, whose forces p are in the normal cone of the box (-inf, 0] at a (d - c) - p. Both are one box
-# problem (controller.complementarity).
+# together with the walls, whose forces p are in the normal cone of the box (-inf, 0] at a (d - c) - p. Slips and wall
+# forces together solve one box problem (controller.complementarity).
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -233,7 +233,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all channels of a ball
-    rho: Array  # (m,) [N/m] resists changes of slip: 0 if proved for any environment (psi = 0), else a share of delta/T
+    rho: Array  # (m,) [N/m] 0 if certified for any environment with psi = 0, else beta times least damping over T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     def __post_init__(self) -> None:

@@ -144,7 +144,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """The number of states without delay lines at the outputs, because these cost little time in a response."""
+        """The number of states, not counting delay lines at outputs, which cost little time in a response."""
         return self._lines[0].size
 
     @property
@@ -195,7 +195,10 @@ class Lti(ReadOnly):
         return G.transpose(2, 0, 1).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """Return C (z I - A)^-1 B, shape (p, m, points). Delay lines add the responses of their heads, delayed."""
+        """Return C (z I - A)^-1 B, shape (p, m, points).
+
+        Each delay line adds the delayed response of its head, the core state that it copies (`_lines`).
+        """
         core, lines = self._lines
         p, m = self.outputs, self.inputs
         spend(_response_cost(core.size, m, points.size))
@@ -238,10 +241,10 @@ class Lti(ReadOnly):
         within 2^_DOUBLINGS samples, so that its response is a finite sum.
 
         The error follows from the residual of (z I - A) X = B. The states
-        X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1, with Y_j = N^j (I - P) B, leave the residual
-        (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1. Its entries, and the
-        response of the outputs to it, are bounded over the unit circle. The bound does not depend on the units of the
-        states. It is compared with the response at a few points, because terms may cancel.
+        X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-(j+1), with Y_j = N^j (I - P) B, leave the residual
+        (V poles - A V) (z - poles)^-1 W B + sum_j (Y_(j+1) - A Y_j) z^-(j+1) - A Y_last z^-(last+1). Its entries, and
+        the response of the outputs to it, are bounded over the unit circle. The bound does not depend on the units of
+        the states. It is compared with the response at a few points, because terms may cancel.
 
         Returns:
             (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None if A is lower
@@ -350,7 +353,7 @@ class Lti(ReadOnly):
         return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
-        """Return the eigenvalues of A, (..., n). Without a stack, delay lines at outputs have exact poles at 0."""
+        """Return the eigenvalues of A, (..., n). For a single system, delay lines at outputs give exactly 0."""
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]

@@ -67,9 +67,9 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """Return the environment, then the vertices of the ranges that differ from it: all, or 128 of them.
+    """Return the nominal environment, then the other vertices: all of them, or those among 128 selected vertices.
 
-    The nominal environment may be one of the 128; then 127 differ from it. Raises ValueError with the field's name if
+    If the nominal environment is one of these 128, the other 127 follow it. Raises ValueError with the field's name if
     the ranges do not fit the network or have too many parameters.
     """
     parts = _parts(network, ranges)
@@ -80,16 +80,17 @@ def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
 
 
 def number_of_vertices(network: Network, ranges: Ranges) -> int:
-    """Return the number of combinations of ends, and of present or absent springs."""
+    """Return the number of vertices; an absent spring counts once, whatever the ends of its ranges."""
     return prod(len(part.corners) for part in _parts(network, ranges))
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that include a linear code.
+    """Return each vertex as the numbers of the parts' corners: all, or 128 vertices.
 
-    The code has 128 words, numbered from 0. Each bit of a corner's number has a mask, and equals the parity of the
-    bitwise AND of the word's number and this mask. All masks have the highest bit, so that the sum of two masks is
-    never a mask. Any three masks are therefore independent, and any three pairs of ends meet in every combination.
+    The 128 vertices are the words of a linear code, numbered from 0. Each bit of a corner's number has a
+    mask, and equals the parity of the bitwise AND of the word's number and this mask. All masks have the highest bit,
+    so that the sum of two masks is never a mask. Any three masks are therefore independent, and any three pairs of
+    ends meet in every combination.
     A spring with ranges that may also be absent is an exception. It usually has 3 or 5 corners, so that several words
     give the same vertex, and some combinations may be missing. Random vertices then replace these words.
     """
@@ -174,7 +175,7 @@ class _Part:
 
 def _parts(network: Network, ranges: Ranges) -> list[_Part]:
     if network.block:
-        raise ValueError("ranges and environment.block: only springs, dampers and masses can have ranges")
+        raise ValueError("ranges with environment.block are not possible: only springs, dampers and masses have ranges")
     if not (ranges.springs or ranges.masses):
         raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")
     named = [frozenset(one.between) for one in ranges.springs]

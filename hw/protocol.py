@@ -323,7 +323,7 @@ def _check(message: Message) -> None:
         else:
             axes = len(value) if axes is None else axes
             if len(value) != axes or not 1 <= axes <= _MAX_AXES:
-                raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {_MAX_AXES} axes, every field the same")
+                raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {_MAX_AXES}, as many in every axis field")
             for axis, entry in enumerate(value, start=1):
                 _check_integer(f"{name}.{field} #{axis}", entry, limits)
 

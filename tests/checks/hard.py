@@ -20,7 +20,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth
 
 CLOSE = 1e-2  # [1/s] largest error of the growth rate with the substeps that the rule picks
-#: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
+#: a setting holds if the integrator is stable with it, its verdict is the exact one, and both errors are at most these
 GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
 RK4, _EULER = ("RK4", 1), ("Euler", 1)
 _TRIED = tuple((name, 1) for name in ("RK4", "Euler", "implicitfast"))
@@ -51,8 +51,10 @@ class _Row:
     off: float | None  # error of `fails`; None if it has no fault or was refused
     rule: int  # RK4 substeps that the rule picks
     substeps: int  # RK4 substeps that hold
-    error: float  # [1/s] growth rate with `substeps` less the exact one
-    holds: bool  # whether `fails` fails, `substeps` hold, and the verdict of the rule's substeps is right
+    error: float  # [1/s] growth rate with `substeps` minus the exact one
+    #: whether `fails` has the expected fault, `substeps` hold (and exceed `rule` only if stated), and the growth rate
+    #: with `rule` has the right sign and an error of at most CLOSE
+    holds: bool
 
 
 @cache
@@ -113,7 +115,7 @@ def hard_loops(seed: int) -> Iterator[_Row]:
 
 
 def measure(hard: _Hard) -> _Row:
-    """Compare the settings that fail and hold with the exact loop. Raises InputError if the rule finds none."""
+    """Compare failing and holding settings with the exact loop. Raises InputError if the rule finds no substeps."""
     loop = assemble(hard.scenario, hard.coupling)
     rule, exact = default_substeps(loop, "RK4"), exact_growth(loop)
     substeps = hard.substeps or rule

@@ -1,4 +1,4 @@
-"""Measure how tight this-environment and known-device are: search the worst hand for loops with too little damping."""
+"""Measure how tight this-environment and known-device are: find the worst hand for loops with too little damping."""
 
 from __future__ import annotations
 

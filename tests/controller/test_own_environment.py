@@ -228,5 +228,5 @@ def test_a_scenario_takes_an_own_environment():
         load().replace(environment=3)
     with pytest.raises(InputError, match=r"^environment Scalar.E\(T\) is 3.0, expected .*Lti with 2 inputs and 2 out"):
         load().replace(environment=type("Scalar", (), {"contacts": ("a", "b"), "E": lambda self, T: 3.0})())
-    with pytest.raises(InputError, match=r"ranges and environment.block"):
+    with pytest.raises(InputError, match=r"ranges with environment.block"):
         own.replace(ranges={"masses": {"left": [0.1, 0.2]}})

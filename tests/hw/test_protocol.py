@@ -146,7 +146,7 @@ def test_frames_equal_the_textbook(message):
     assert crc_bitwise(b"123456789") == 0xCBF43926  # the check value that the CRC catalogue gives for CRC-32
 
 
-def test_the_code_sends_the_pages_worked_example():
+def test_encode_gives_the_worked_example_of_the_documentation():
     """docs/protocol.md, "A worked example": each hex line is a frame, the line above it the message."""
     text = DOC.read_text().split("## A worked example", 1)[1]
     pairs = re.findall(r"^# (\w+\(.*\))\n((?:[0-9a-f]{2} ?)+)$", text, re.M)
@@ -161,12 +161,12 @@ def test_the_code_sends_the_pages_worked_example():
 BAD = [
     (STATE._replace(tick=70_000), "State.tick: 70000; 0 to 65535"),
     (STATE._replace(counts=(1, 2**31)), "State.counts #2: 2147483648; -2147483648 to 2147483647"),
-    (STATE._replace(counts=(1,)), "State.applied: 2 entries; 1 to 8 axes, every field the same"),
+    (STATE._replace(counts=(1,)), "State.applied: 2 entries; 1 to 8, as many in every axis field"),
     (FORCE._replace(force=(1, float("nan"))), "Force.force #2: nan; integers only"),
     (FORCE._replace(force=(1.5, 0)), "Force.force #1: 1.5; integers only"),
     (FORCE._replace(force=(0, 40_000)), "Force.force #2: 40000; -32768 to 32767"),
-    (FORCE._replace(force=()), "Force.force: 0 entries; 1 to 8 axes, every field the same"),
-    (FORCE._replace(force=(0,) * 9), "Force.force: 9 entries; 1 to 8 axes, every field the same"),
+    (FORCE._replace(force=()), "Force.force: 0 entries; 1 to 8, as many in every axis field"),
+    (FORCE._replace(force=(0,) * 9), "Force.force: 9 entries; 1 to 8, as many in every axis field"),
     (FORCE._replace(force=3), "Force.force: 3; a tuple with one integer per axis"),
     (FORCE._replace(command=None), "Force.command: None; integers only"),
     (CONFIG._replace(theta=16), "Config.theta: 16; 0 to 15"),
@@ -275,7 +275,7 @@ def disarmed() -> Device:
     return device
 
 
-def rides_on(device: Device, data: bytes, now: int, k: int) -> None:
+def assert_no_force_after(device: Device, data: bytes, now: int, k: int) -> None:
     """Feed a piece of data and tick; the motors must carry no force."""
     device.receive(data, now)
     forces, sent = device.tick(now, (k, -k))
@@ -291,7 +291,7 @@ def test_a_million_random_bytes_move_no_motor():
         noise = rng.randbytes(1_000_000)
         assert host.feed(noise) == []
         for k in range(0, len(noise), 500):
-            rides_on(device, noise[k : k + 500], k, k)
+            assert_no_force_after(device, noise[k : k + 500], k, k)
             silent.receive(noise[k : k + 500], k)
             assert silent.tick(k, (0, 0)) == ((0, 0), b"")
     assert host.rejected > 3000 * rounds
@@ -300,7 +300,7 @@ def test_a_million_random_bytes_move_no_motor():
 
 
 def mutations(rng: random.Random, frame: bytes):
-    """Yield damaged copies of a frame, each followed by the delimiter; the frame itself is passed without it.
+    """Yield damaged copies of a frame, each with a delimiter at the end; the argument `frame` has none.
 
     Copies have wrong bits or bytes, holes, insertions, cuts or swapped halves.
     """
@@ -333,7 +333,7 @@ def test_mutated_commands_arm_nothing_and_move_nothing():
         good = Force(
             Command.ARM if n % 2 else Command.RUN, (device.k + 1) & 0xFFFF, device.k, (0, 0) if n % 2 else (9000, 9000)
         )
-        rides_on(device, next(mutations(rng, encode(good)[:-1])), n, n)
+        assert_no_force_after(device, next(mutations(rng, encode(good)[:-1])), n, n)
     assert device.phase == Phase.DISARMED
     device.receive(encode(Force(Command.ARM, (device.k + 1) & 0xFFFF, device.k, (0, 0))), 0)
     device.tick(0, (0, 0))
