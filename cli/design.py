@@ -122,7 +122,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
-            raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
+            raise InputError(f"--ranges with {'[ranges]' if loop.ranges else 'environment.walls'}: leave out --ranges")
         with options.refused(f"--ranges {args.ranges:g}: "):
             loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
             loop.members()

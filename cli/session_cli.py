@@ -161,7 +161,7 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Return `touched` for FILE, a function that returns False for `key`, or None without a switch on this machine."""
+    """Return `touched(FILE)`; for `key` a function that returns False; None without a switch on this machine."""
     if named in (None, "device"):
         return None
     return touched(named) if named != "key" else lambda: False  # The driver reads the keys.
