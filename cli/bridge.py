@@ -20,7 +20,7 @@ from haptic_loop.cli.world import world_start
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import lost_output, plain, write_json
 from haptic_loop.design.result import CAVEATS, listed
-from haptic_loop.hw.control import CertifiedCoupling, certified_couplings, timed
+from haptic_loop.hw.control import CertifiedCoupling, CouplingRequest, certified_couplings, timed
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.recording import Recorder
@@ -61,10 +61,17 @@ def main(argv: list[str]) -> int:
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
-        choice = args.case, args.coupling, args.condition
-        budget = args.energy_budget and args.energy_budget[0]
-        energies = {"start": start, "energy_budget": budget}
-        programs = certified_couplings(met, *choice, link, limiter=args.limiter, behind=behind, **energies)
+        request = CouplingRequest(
+            met,
+            args.case,
+            args.coupling,
+            args.condition,
+            limiter=args.limiter,
+            behind=behind,
+            start=start,
+            energy_budget=args.energy_budget and args.energy_budget[0],
+        )
+        programs = certified_couplings(request, link)
         steps = session.units.encoder_step
         programs = [_with_encoder_steps(program, steps) for program in programs]
         console.print(verdict(programs[0].assessment), soft_wrap=True)

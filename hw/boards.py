@@ -17,7 +17,7 @@ from typing import Any
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import CLOCK_TOLERANCE
-from haptic_loop.hw.haptic_device import PortLost, SerialDevice
+from haptic_loop.hw.haptic_device import LONGEST_WAIT, PortLost, SerialDevice
 from haptic_loop.hw.monitor import CommandMonitor
 
 _CLEARLY_FASTER = 1e-4  # relative difference of two clocks that stands out from jitter after _COMPARED ticks
@@ -27,7 +27,6 @@ _TOO_EARLY = 1.5  # [periods] largest lead; with a larger lead, the board's forc
 _SMOOTHED = 31  # number of leads whose median is used; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
-_LONGEST = 5e-4  # [s] longest time for which one call waits
 _EXCHANGE = "exchange the ports, or the delays (--theta)"
 #: phases of a board that the STATE of all boards shows before ARMED and HOLDING, the worst first
 _FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SILENT, wire.Phase.DISARMED)
@@ -221,7 +220,7 @@ class Boards:
                 board.info = board.info or board.device.info()
             known = [board.info for board in self._boards if board.info]
             if len(known) < len(self._boards):
-                self._wait(_LONGEST)
+                self._wait(LONGEST_WAIT)
                 return None
         first = known[0]
         for i, (info, board) in enumerate(zip(known, self._boards, strict=True), start=1):
@@ -252,7 +251,7 @@ class Boards:
                         board.device.exchange(None)  # discard the STATEs that a configured board already sends
         answers = [board.answer for board in self._boards if board.answer is not None]
         if len(answers) < len(self._boards):
-            self._wait(_LONGEST)
+            self._wait(LONGEST_WAIT)
             return None
         self._asked, self._configured = None, True
         return max(answers)
@@ -260,7 +259,7 @@ class Boards:
     def exchange(self, force: wire.Force | None) -> wire.State | None:
         """Send every board its part of a force, and return the STATE of the next step, or None until it is complete."""
         if not self._configured:
-            self._wait(_LONGEST)
+            self._wait(LONGEST_WAIT)
             return None
         heard = False
         with self._together():
@@ -273,7 +272,7 @@ class Boards:
                     with _named(i):
                         board.hear(state, self._clock(), self._driving)
             if not heard:
-                self._wait(_LONGEST)
+                self._wait(LONGEST_WAIT)
         return self._next()
 
     def stop(self, reason: wire.Reason) -> None:

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import sub
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -554,28 +554,30 @@ class CertifiedCoupling:
         return [*said, f"a force that is held through {answers} is covered by the file's proof{below}"]
 
 
-def certified_coupling(
-    scenario: Scenario,
-    case: str,
-    name: str | None,
-    condition: str | Condition | None,
-    link: int,
-    own: Coupling | Design | None = None,
-    limiter: bool | None = None,
-    start: float = START_J,
-    behind: tuple[int, ...] = (),
-    energy_budget: float | None = None,
-) -> CertifiedCoupling:
-    """Return the coupling `name`, or the user's coupling `own`, certified for a link of `link` ticks (0: on arrival).
+@dataclass(frozen=True, eq=False)
+class CouplingRequest:
+    """The coupling that a session asks for. The delay of the link is a separate argument."""
 
-    The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
-    them, with W0 = `start` [J]. Elsewhere they may have an `energy_budget` [J]; the coupling must be certified without
-    it, and the guarantee is that of the budget. With several boards, forces act `behind` (m,) ticks later than `link`,
-    and each board has its own clock. The longest period that the certificate covers is then longer by the share
-    CLOCK_TOLERANCE.
+    scenario: Scenario
+    case: str = "I"
+    name: str | None = None  # kind or file of the coupling; None: the default kind
+    condition: str | Condition | None = None
+    own: Coupling | Design | None = None  # the user's coupling, used instead of `name`
+    limiter: bool | None = None  # False: the coupling's limiter does not limit the forces
+    behind: tuple[int, ...] = ()  # (m,) ticks that several boards, each with its own clock, add to the link
+    start: float = START_J  # W0 [J] of the energy shell, which limits the forces of a MuJoCo world
+    energy_budget: float | None = None  # W0 [J] of a budget for the forces outside of worlds
+
+
+def certified_coupling(request: CouplingRequest, link: int) -> CertifiedCoupling:
+    """Return the requested coupling, certified for a link of `link` ticks (0: forces act on arrival).
+
+    A coupling must be certified without its energy budget, but its guarantee is then that of the budget. With several
+    boards, the longest period that the certificate covers is longer by the share CLOCK_TOLERANCE.
 
     Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """
+    scenario, case, behind, limiter = request.scenario, request.case, request.behind, request.limiter
     if link > MAX_THETA:
         raise SafetyStop(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
     later = behind or (0,) * scenario.channels
@@ -585,12 +587,15 @@ def certified_coupling(
         # No shortest period is known, because the clocks drift.
         slower = slower.replace(T_max=(scenario.T_max or scenario.T) * (1 + CLOCK_TOLERANCE), T_min=None)
     try:
-        chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
+        if request.own is None:
+            chosen = choose(slower, case, request.name, request.condition, limiter)
+        else:
+            chosen = given(request.own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' * (link != 1)}: {error}") from None
     alone = slower.replace(ranges=None) if slower.ranges else slower  # only the nominal environment is rendered
     if is_world(alone):
-        assessment = assessed(alone, case, chosen, energy_budget=start, limiter=False)
+        assessment = assessed(alone, case, chosen, energy_budget=request.start, limiter=False)
     else:
         assessment = assessed(alone, case, chosen, limiter=limiter)
     spare = (n - more for n, more in zip(slower.theta, later, strict=True))
@@ -599,26 +604,16 @@ def certified_coupling(
     if not certified.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(certified)}")
-    if energy_budget is None or is_world(alone):
+    if request.energy_budget is None or is_world(alone):
         return certified
-    assessment = assessed(alone, case, chosen, energy_budget=energy_budget, limiter=limiter)
+    assessment = assessed(alone, case, chosen, energy_budget=request.energy_budget, limiter=limiter)
     if assessment.guarantee is None:
         raise SafetyStop(f"with an energy budget the coupling is not certified: {assessment.reason}")
     return replace(certified, assessment=assessment)
 
 
-def certified_couplings(
-    scenario: Scenario,
-    case: str,
-    name: str | None,
-    condition: str | Condition | None,
-    link: int,
-    spare: int = 2,
-    **more: Any,
-) -> tuple[CertifiedCoupling, ...]:
+def certified_couplings(request: CouplingRequest, link: int, spare: int = 2) -> tuple[CertifiedCoupling, ...]:
     """Return the coupling for the measured delay, and up to `spare` reserves, each for a link slower by one tick.
-
-    `more` are the other arguments of `certified_coupling`.
 
     A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on no
     channel. It needs less damping than the previous coupling would need with the delays of the reserve. A reserve has
@@ -626,13 +621,15 @@ def certified_couplings(
     spring-damper is designed by Theorem 4, which has the strongest guarantee, or by the user's own condition. If this
     fails, too, the list ends. Raises SafetyStop where the first coupling is not certified.
     """
-    candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
-    fallback = _FALLBACK if candidates[0].chosen.own is None else (_FALLBACK[0], condition)
-    wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), fallback]
+    candidates = [certified_coupling(request, link)]
+    kind, condition = _FALLBACK
+    if candidates[0].chosen.own is not None:
+        condition = request.condition
+    wanted = [request, replace(request, name=kind, condition=condition)]
     while len(candidates) <= spare and wanted:
         reserve = None
         with suppress(SafetyStop, InputError):
-            reserve = certified_coupling(scenario, case, *wanted[0], candidates[-1].link + 1, **more)
+            reserve = certified_coupling(wanted[0], candidates[-1].link + 1)
         if reserve and _softer(reserve, candidates[-1]):
             candidates.append(reserve)
         else:

@@ -15,7 +15,7 @@ from haptic_loop.hw import protocol as wire
 
 _RESEND = 0.1  # [s] time after which an unanswered question is sent again
 _STOPPING = 0.05  # [s] longest time after the first CONFIG for which the device may drive
-_LONGEST_WAIT = 5e-4  # [s] longest wait of one call
+LONGEST_WAIT = 5e-4  # [s] longest wait of one call
 
 
 class PortLost(OSError):
@@ -68,7 +68,7 @@ class SerialDevice:
     """A device at a serial port. The device has the clock, not the host."""
 
     def __init__(
-        self, port: _BytePort, clock: Callable[[], float] = time.monotonic, patience: float = _LONGEST_WAIT
+        self, port: _BytePort, clock: Callable[[], float] = time.monotonic, patience: float = LONGEST_WAIT
     ) -> None:
         """Take `clock` and `patience`, the longest wait of a call, both in seconds."""
         self._port, self._clock, self._patience = port, clock, patience

@@ -20,7 +20,14 @@ from haptic_loop.design.api import COUPLING, bare
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.result import Design
 from haptic_loop.hw.boards import Boards
-from haptic_loop.hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
+from haptic_loop.hw.control import (
+    Armable,
+    CertifiedCoupling,
+    CouplingRequest,
+    certified_coupling,
+    certified_couplings,
+    timed,
+)
 from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
 from haptic_loop.hw.haptic_device import HapticDevice, PortLost, SerialDevice
@@ -312,9 +319,9 @@ def rehearse(
     def plan(ages: Ages) -> list[CertifiedCoupling]:
         met, link = timed(scenario, ages, _QUANTILE, _GUARD_US, latch_on_arrival)
         if coupling is None:
-            programs.extend(certified_couplings(met, case, None, None, link))
+            programs.extend(certified_couplings(CouplingRequest(met, case), link))
         else:
-            programs.append(certified_coupling(met, case, None, None, link, coupling))
+            programs.append(certified_coupling(CouplingRequest(met, case, own=coupling), link))
         return programs
 
     stop = seconds, lambda session, now: session.stop("requested", now)

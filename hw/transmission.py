@@ -23,7 +23,7 @@ from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra, fitted, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N causes less motion than a count of 5 um
-_TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
+_ALLOWED = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
 #: largest rms error, in units of the allowed error: play or presliding friction give 3 to 6, dry friction up to 2.1
 _UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
@@ -58,7 +58,7 @@ class _Joint:
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:
         self.records = records
-        self._scale = [np.hypot(step * np.sqrt(r.ticks / 12), _TOLD * np.abs(r.motion)) for r in records]
+        self._scale = [np.hypot(step * np.sqrt(r.ticks / 12), _ALLOWED * np.abs(r.motion)) for r in records]
 
     def errors(self, p: Array) -> list[NDArray[np.complex128]]:
         """Return the difference of motion and model for every record, in units of the allowed error."""

@@ -16,7 +16,7 @@ import sys
 import time
 from collections import defaultdict
 
-from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.haptic_device import SerialDevice
@@ -41,7 +41,7 @@ class _Bench(SerialPort):
         self.scenario = _lively(load())
         self.far, self._emulator = Terminal(), Emulator(self.scenario)
         super().__init__(self.far.path, None)
-        self.made = certified_couplings(self.scenario, "I", None, None, 1, spare=0)
+        self.made = certified_couplings(CouplingRequest(self.scenario), 1, spare=0)
         self.session = session_for(self.scenario, LinkSettings(measure=60))
         self.session.record = Recorder(self.scenario.channels)
         self.law, self._decoder = self.made[0].controller(self.session.limits.cap), Decoder()

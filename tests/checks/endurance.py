@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -43,7 +43,7 @@ _Mark = Callable[[float], None]  # called with the share of the work that is don
 def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
     """Run a session in virtual time, armed for `seconds`; return whether it ended as planned, and how."""
     scenario = load()
-    made = certified_couplings(scenario, "I", None, None, 1, spare=0)
+    made = certified_couplings(CouplingRequest(scenario), 1, spare=0)
     session, emulator = session_for(scenario, LinkSettings()), Emulator(scenario)
     actions = [(seconds, person("stop"))]
     rehearsal = Rehearsal(session, emulator, lambda ages: made, actions=actions, keep=False)

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
+from haptic_loop.hw.control import CertifiedCoupling, CouplingRequest, certified_couplings
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
@@ -532,7 +532,7 @@ def rehearse_faults() -> list[_FaultOutcome]:
         runs.append((weak, weak, None, _weak_cases(name, axis)))
     outcomes = []
     for held, free, cap, cases in runs:
-        couplings = [certified_couplings(each, "I", None, None, 1, spare=1) for each in (held, free)]
+        couplings = [certified_couplings(CouplingRequest(each), 1, spare=1) for each in (held, free)]
         for case in cases:
             outcome = _rehearse_case(case, held, couplings[0], cap=cap)[1]
             fastest = _rehearse_case(case, free, couplings[1], free=True, cap=cap)[1].peak_speed
@@ -651,7 +651,7 @@ def _plan(case: Fault, scenario: Scenario, couplings: tuple[CertifiedCoupling, .
         link = ages.link_delay(1e6 * scenario.T, 0.99, 100.0)
         if (link, case.coupling) == (1, None):
             return couplings
-        return certified_couplings(scenario, "I", case.coupling, None, link, spare=0)
+        return certified_couplings(CouplingRequest(scenario, name=case.coupling), link, spare=0)
 
     return plan
 

@@ -10,7 +10,7 @@ import pytest
 
 from haptic_loop import certify, design_coupling, load
 from haptic_loop.design.files import InputError
-from haptic_loop.hw.control import SafetyStop, certified_coupling
+from haptic_loop.hw.control import CouplingRequest, SafetyStop, certified_coupling
 from tests.evaluate import decisive
 
 PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
@@ -198,7 +198,7 @@ def test_only_the_given_condition_arms_a_device(folder, monkeypatch):
     (folder / "never.py").write_text(NEVER)
     own = import_module("never").Never()
     with pytest.raises(SafetyStop, match=r"theta = \[1, 2\]: .*never needs 2\."):
-        certified_coupling(load("omega-pair"), "I", "joined.json", own, 1)
+        certified_coupling(CouplingRequest(load("omega-pair"), name="joined.json", condition=own), 1)
 
 
 def test_exported_blocks_state_the_claim_of_own_conditions(folder, monkeypatch, capsys):

@@ -32,7 +32,7 @@ from haptic_loop.design.exact import _Matrix
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import RANGES, NotProved, switching_guarantee
-from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.couplings import from_file
 from haptic_loop.sim.run import assemble
@@ -430,19 +430,20 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve exists
+    # No reserve exists.
+    (first,) = certified_couplings(CouplingRequest(scenario, name=str(tmp_path / "one.json")), 1, spare=1)
     (remark,) = first.remarks()
     assert "1 missed answer " in remark
     late = change(LOOP, theta=(2, 2), lam=(2, 2), varying_delay=DelayRange((2, 2), (2, 2)))
     save(Stored.of(late, SOFT, prove(late, SOFT, "this-environment")), tmp_path / "two.json")
-    (early,) = certified_couplings(scenario, "I", str(tmp_path / "two.json"), None, 1, spare=0)
+    (early,) = certified_couplings(CouplingRequest(scenario, name=str(tmp_path / "two.json")), 1, spare=0)
     assert early.held == 0  # The delay of 1 sample lies below the range on file.
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST
     met = ages(missed)[1:]
     assert RANGE.contains(DelayRange(tuple(met.min(axis=(0, 2))), tuple(met.max(axis=(0, 2)))))
     later = scenario.replace(theta=(2, 2))
-    (second,) = certified_couplings(later, "I", str(tmp_path / "one.json"), None, 2, spare=0)
+    (second,) = certified_couplings(CouplingRequest(later, name=str(tmp_path / "one.json")), 2, spare=0)
     assert second.scenario.theta == (2, 2)
     assert second.remarks() == [f"the file proves {WITHIN}, which covers the constant theta = [2, 2]"]
     longer = change(LOOP, theta=(2, 2), varying_delay=DelayRange((2, 2), (3, 3)))

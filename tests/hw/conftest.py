@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.sim.scenario import load as scenario_of
 from tests.checks.faults import CASES, LATE, _lively, _prepared
 
@@ -18,7 +18,7 @@ def scenario():
 @pytest.fixture(scope="session")
 def link_couplings(scenario):
     """Return certified couplings for links of one and two ticks."""
-    return certified_couplings(scenario, "I", None, None, 1, spare=1)
+    return certified_couplings(CouplingRequest(scenario), 1, spare=1)
 
 
 @pytest.fixture(scope="session")

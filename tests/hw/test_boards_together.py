@@ -14,7 +14,7 @@ from shared import checkered
 from haptic_loop.cli import bridge, identify, session_cli
 from haptic_loop.hw import boards, transport
 from haptic_loop.hw.boards import ticks_behind
-from haptic_loop.hw.control import CLOCK_TOLERANCE, certified_coupling
+from haptic_loop.hw.control import CLOCK_TOLERANCE, CouplingRequest, certified_coupling
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -40,7 +40,7 @@ def alone(scenario):
 
 @pytest.fixture(scope="module")
 def couplings(scenario):
-    return (certified_coupling(scenario, "I", None, None, 1, behind=BEHIND),)
+    return (certified_coupling(CouplingRequest(scenario, behind=BEHIND), 1),)
 
 
 def rehearsal_of(scenario, alone, couplings, clock=1.0, faults=((), ()), begin_us=300.0, infos=(None, None), **options):
@@ -224,8 +224,8 @@ def test_the_command_runs_over_two_serial_ports(scenario, alone, couplings, monk
     rehearsal = rehearsal_of(scenario, [nobody(one) for one in alone], (), 1.0001, begin_us=SLIP_SOON)
     ports = _Terminals(rehearsal, monkeypatch).ports
 
-    def certified(scenario, *asked, behind, **more):
-        assert (asked[3], behind) == (1, BEHIND)
+    def certified(request, link):
+        assert (link, request.behind) == (1, BEHIND)
         return couplings
 
     monkeypatch.setattr(bridge, "certified_couplings", certified)

@@ -13,7 +13,7 @@ from shared import FakePort
 from haptic_loop.cli import bridge, replay, session_cli
 from haptic_loop.cli.session_cli import check_link
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.hw.control import certified_coupling, certified_couplings, timed
+from haptic_loop.hw.control import CouplingRequest, certified_coupling, certified_couplings, timed
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import info_of
@@ -151,7 +151,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 
         def plan(ages):
             judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
-            couplings.extend(certified_couplings(judged, "I", None, None, link, spare=0, own=own))
+            couplings.extend(certified_couplings(CouplingRequest(judged, own=own), link, spare=0))
             return couplings
 
         live = Live(session, device, plan, Operator(True, seconds), watch=watch)
@@ -213,9 +213,9 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     assert link == 0
     judged = judged.replace(latency=((0.0, 130e-6),) * 2)
     given = SpringDamper([879.0, 552.0], [0.39, 0.52])
-    host = certified_coupling(judged, "I", None, None, 0, given)
-    link = certified_coupling(scenario.replace(theta=(1, 2)), "I", None, None, 1, given)
-    constant = certified_coupling(judged.replace(latency=((130e-6, 130e-6),) * 2), "I", None, None, 0, given)
+    host = certified_coupling(CouplingRequest(judged, own=given), 0)
+    link = certified_coupling(CouplingRequest(scenario.replace(theta=(1, 2)), own=given), 1)
+    constant = certified_coupling(CouplingRequest(judged.replace(latency=((130e-6, 130e-6),) * 2), own=given), 0)
     latest, ranged = (
         max(one.assessment.requirements["this-environment"].required) for one in (constant, host)
     )  # the range needs at least as much as its largest latency, and less than 0.13 ms in periods of 1.33 ms
@@ -323,7 +323,7 @@ def test_emergency_stops_zero_forces_at_once(scenario):
     with ForceDimension(scenario, "1x,0x", sdk, sdk.clock, sdk.sleep) as device:
 
         def plan(ages):
-            return [certified_coupling(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, SOFT)]
+            return [certified_coupling(CouplingRequest(timed(scenario, ages, 0.99, 50.0, True)[0], own=SOFT), 0)]
 
         live = Live(session, device, plan, Operator(True, 3.0), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)

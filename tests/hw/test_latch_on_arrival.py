@@ -14,7 +14,7 @@ from haptic_loop.cli.bridge import main as bridge
 from haptic_loop.cli.replay import main as replay
 from haptic_loop.design.certificate import required_damping
 from haptic_loop.design.result import HERE
-from haptic_loop.hw.control import certified_couplings, timed
+from haptic_loop.hw.control import CouplingRequest, certified_couplings, timed
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
@@ -41,7 +41,7 @@ def test_the_last_force_holds_until_the_answer(share):
     def plan(ages):
         met, link = timed(LAB, ages, 0.99, 100.0, at_once=True)
         assert met.latency == ((pytest.approx(30e-6), pytest.approx(230e-6)),) * 2
-        return certified_couplings(met, "I", None, None, link, spare=0)
+        return certified_couplings(CouplingRequest(met), link, spare=0)
 
     faults = (FaultInjection.parse(f"cross={share}"),)
     emulator = Emulator(LAB, faults)
@@ -77,7 +77,7 @@ def test_the_last_force_holds_until_the_answer(share):
 def test_coupled_motors_are_found_at_arming():
     def plan(ages):
         met, link = timed(LAB, ages, 0.99, 100.0, at_once=True)
-        return certified_couplings(met, "I", None, None, link, spare=0)
+        return certified_couplings(CouplingRequest(met), link, spare=0)
 
     session, faults = session_for(LAB, LinkSettings(measure=60)), (FaultInjection.parse("cross=-1"),)
     Rehearsal(session, Emulator(LAB, faults), plan, faults).run_until_armed(1.0)
@@ -97,9 +97,9 @@ def test_certificates_cover_the_spread_of_ticks():
     spread, _ = timed(LAB, Ages((130,) * 100, 0, (1150,) * 60 + (1320,) * 40), 0.99, 100.0)
     assert spread.T_max == pytest.approx(1.32e-3)
     needs = [
-        certified_couplings(s.replace(delta=(2.0, 2.0)), "I", "published", "this-environment", 1, spare=0)[
-            0
-        ].assessment.requirements
+        certified_couplings(
+            CouplingRequest(s.replace(delta=(2.0, 2.0)), name="published", condition="this-environment"), 1, spare=0
+        )[0].assessment.requirements
         for s in (even, spread)
     ]
     even_need, spread_need = (max(need["this-environment"].required) for need in needs)
@@ -122,7 +122,9 @@ def test_known_devices_cover_ticks_that_are_short():
     """A coupling for the constant T needs more damping with ticks of 0.6 ms."""
     known, ticks = load("omega-pair-known"), (600,) * 40 + (1200,) * 60
     met, link = timed(known, Ages((130,) * 100, 0, ticks), 0.99, 100.0)
-    constant, covered = (certified_couplings(s, "I", None, "known-device", link, spare=0)[0] for s in (known, met))
+    constant, covered = (
+        certified_couplings(CouplingRequest(s, condition="known-device"), link, spare=0)[0] for s in (known, met)
+    )
     needed = required_damping(met.loop("I"), constant.chosen.coupling, "known-device")
     assert needed.ratio > 1 > required_damping(known.loop("I"), constant.chosen.coupling, "known-device").ratio
     assert required_damping(met.loop("I"), covered.chosen.coupling, "known-device").certified
@@ -137,7 +139,7 @@ def test_the_power_of_overlong_ticks_is_bounded():
 
 @pytest.mark.slow
 def test_couplings_are_named_with_their_latency():
-    (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
+    (made,) = certified_couplings(CouplingRequest(LAB.replace(latency=((3e-5, 2.3e-4),) * 2)), 0, spare=0)
     assert made.assessment.loop.latency == ((3e-5, 2.3e-4),) * 2
     assert made.link == 0
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"

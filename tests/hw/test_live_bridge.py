@@ -26,7 +26,7 @@ from haptic_loop.cli.options import Parser
 from haptic_loop.cli.session_cli import add_link_options, check_link
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.design.files import one_command
-from haptic_loop.hw.control import certified_coupling
+from haptic_loop.hw.control import CouplingRequest, certified_coupling
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
@@ -186,7 +186,7 @@ def test_signals_end_sessions_while_forces_act(scenario, name, stage):
             sent.append(name)
             signal.raise_signal(getattr(signal, name))
 
-    sent, plan = [], lambda ages: [certified_coupling(scenario, "I", None, None, 2)]
+    sent, plan = [], lambda ages: [certified_coupling(CouplingRequest(scenario), 2)]
     rehearsal = rehearsal_of(scenario, ())
     session = rehearsal.session
     live = Live(session, rehearsal._driver.device, plan, Operator(True, 20.0), watch=watch)
@@ -210,7 +210,7 @@ def test_a_second_signal_names_both(scenario):
             signal.raise_signal(signal.SIGTERM)
             signal.raise_signal(signal.SIGHUP)
 
-    plan = lambda ages: [certified_coupling(scenario, "I", None, None, 2)]  # noqa: E731
+    plan = lambda ages: [certified_coupling(CouplingRequest(scenario), 2)]  # noqa: E731
     rehearsal = rehearsal_of(scenario, ())
     live = Live(rehearsal.session, rehearsal._driver.device, plan, Operator(True, 20.0), watch=watch)
     live.clock = lambda: round(rehearsal.now)
@@ -402,7 +402,7 @@ def test_an_exception_in_the_design_is_raised_again(emulator, scenario):
 
 def test_uncertified_couplings_are_not_armed(emulator, scenario):
     def plan(ages):
-        return [certified_coupling(scenario, "I", "published", None, 1)]
+        return [certified_coupling(CouplingRequest(scenario, name="published"), 1)]
 
     session, _ = run(emulator, scenario, plan)
     assert session.stage == Stage.REFUSED

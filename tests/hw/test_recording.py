@@ -13,7 +13,7 @@ from haptic_loop.cli import bridge
 from haptic_loop.cli import replay as replay_command
 from haptic_loop.cli import trace as trace_command
 from haptic_loop.design.files import plain
-from haptic_loop.hw.control import CertifiedCoupling, _fill, certified_coupling
+from haptic_loop.hw.control import CertifiedCoupling, CouplingRequest, _fill, certified_coupling
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.monitor import LinkSettings
@@ -212,7 +212,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     With the certified coupling nothing grows. Only ticks at full gain before the first cut force count.
     """
     scenario = scenario_of()  # Here people begin slowly, unlike in the fixture's scenario.
-    made = certified_coupling(scenario, "I", None, None, 1) if settles else None
+    made = certified_coupling(CouplingRequest(scenario), 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)
         made = FalselyCertified(1, scenario, "I", chosen, assessed(scenario, "I", chosen))
@@ -262,7 +262,7 @@ def test_sessions_limit_force_vectors(tmp_path):
     settings = LinkSettings(measure=60, test_encoders=False)
     session, recorder = session_for(scenario, settings, 0.3), Recorder(4)
     session.record = recorder
-    made = certified_coupling(scenario, "I", None, "any-environment", 1)
+    made = certified_coupling(CouplingRequest(scenario, condition="any-environment"), 1)
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: [made])
     rehearsal.run_until_armed(1.0)
     rehearsal.run(1e-6 * session.now + 0.5)

@@ -18,7 +18,14 @@ from haptic_loop.controller.law import Law
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.hw.control import BudgetPlan, SentBudget, _HostController, certified_coupling, certified_couplings
+from haptic_loop.hw.control import (
+    BudgetPlan,
+    CouplingRequest,
+    SentBudget,
+    _HostController,
+    certified_coupling,
+    certified_couplings,
+)
 from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
@@ -359,7 +366,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, link_couplings):
 @pytest.mark.slow
 def test_long_delays_wait_in_the_host(scenario):
     """Of delays of 16 and 17 ticks, 15 are the line's, so the host delays its forces by one and two ticks."""
-    (made,) = certified_couplings(scenario.replace(theta=(16, 17)), "I", None, None, 1, spare=0)
+    (made,) = certified_couplings(CouplingRequest(scenario.replace(theta=(16, 17))), 1, spare=0)
     controller = made.controller((12.0, 12.0))
     answers = np.array([controller.step((1e-3 * (k == 0), 1e-3 * (k == 0))) for k in range(4)])
     assert (answers != 0).tolist() == [[False, False], [True, False], [True, True], [True, True]]
@@ -371,9 +378,9 @@ def test_long_delays_wait_in_the_host(scenario):
 
 def test_nothing_uncertified_is_loaded(scenario, link_couplings):
     with pytest.raises(SafetyStop, match=r"published .* theta = \[1, 2\]: any-environment needs 7.629"):
-        certified_coupling(scenario, "I", "published", None, 1)
+        certified_coupling(CouplingRequest(scenario, name="published"), 1)
     with pytest.raises(SafetyStop, match="at most theta = 15"):
-        certified_coupling(scenario, "I", None, None, 16)
+        certified_coupling(CouplingRequest(scenario), 16)
     session = session_with(scenario)
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: ())
     rehearsal.run_until_armed(0.1)
@@ -404,7 +411,7 @@ def optimal_couplings(scenario):
     """Return optimal couplings of the first bases, without the search over larger ones."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)
-        return certified_couplings(scenario, "I", "optimal", None, 1, spare=1)
+        return certified_couplings(CouplingRequest(scenario, name="optimal"), 1, spare=1)
 
 
 def assert_in_reserve(link_couplings):
@@ -443,13 +450,13 @@ def test_optimal_couplings_have_a_reserve(optimal_couplings, capsys):
 def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_couplings, tmp_path):
     path = tmp_path / "stiff.json"
     save_coupling(Stored(scenario.loop("I"), optimal_couplings[0].chosen.coupling.form()), path)
-    link_couplings = certified_couplings(scenario, "I", str(path), None, 1)
+    link_couplings = certified_couplings(CouplingRequest(scenario, name=str(path)), 1)
     assert [r.chosen.kind for r in link_couplings] == ["stiff.json", "spring-damper", "spring-damper"]
     assert [r.link for r in link_couplings] == [1, 2, 3]
     assert all(r.certified for r in link_couplings)
     assert_in_reserve(link_couplings)
     with pytest.raises(SafetyStop, match=r"stiff\.json .* theta = \[2, 2\]"):
-        certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
+        certified_couplings(CouplingRequest(scenario, name=str(path)), 2)  # no reserve replaces the file's coupling
 
 
 @pytest.mark.slow
@@ -646,15 +653,17 @@ def test_walls_on_the_bridge_replay_bit_by_bit(tmp_path, capsys):
 
 def test_budgets_need_a_coupling_certified_without_them(scenario):
     """The account guarantees an energy for any controller, but a session also needs a coupling that comes to rest."""
-    soft = certified_coupling(scenario, "I", None, None, 1, energy_budget=0.01)
+    soft = certified_coupling(CouplingRequest(scenario, energy_budget=0.01), 1)
     assert soft.certified
     assert (soft.assessment.guarantee.condition, soft.assessment.guarantee.energy_J) == ("energy-budget", 0.01)
     with pytest.raises(SafetyStop, match="is not certified"):
-        certified_coupling(scenario, "I", None, None, 1, SpringDamper((5000.0, 5000.0), (0.1, 0.1)), energy_budget=0.01)
+        certified_coupling(
+            CouplingRequest(scenario, own=SpringDamper((5000.0, 5000.0), (0.1, 0.1)), energy_budget=0.01), 1
+        )
     mine = type("Mine", (type(THIS_ENVIRONMENT),), {"name": "mine"})()
-    assert certified_coupling(scenario, "I", None, mine, 1).certified
+    assert certified_coupling(CouplingRequest(scenario, condition=mine), 1).certified
     with pytest.raises(SafetyStop, match="your own condition mine does not cover forces that an energy account scales"):
-        certified_coupling(scenario, "I", None, mine, 1, energy_budget=0.01)
+        certified_coupling(CouplingRequest(scenario, condition=mine, energy_budget=0.01), 1)
 
 
 @pytest.mark.parametrize(("length", "exceeded"), [(1e-3, False), (2e-3, True)])

@@ -10,7 +10,7 @@ from haptic_loop.cli import bridge, replay
 from haptic_loop.controller.budget import Shell
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.lti import Lti
-from haptic_loop.hw.control import WorldController, certified_couplings, timed
+from haptic_loop.hw.control import CouplingRequest, WorldController, certified_couplings, timed
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -150,7 +150,7 @@ def in_the_ball_world(name, until, *faults):
 
     def plan(ages):
         met, link = timed(scenario, ages, 0.99, 100.0)
-        return certified_couplings(met, "I", "moving-average", None, link, spare=0)
+        return certified_couplings(CouplingRequest(met, name="moving-average"), link, spare=0)
 
     stop = [(until, lambda session, now: session.stop("asked to", now))]
     Rehearsal(session, Emulator(scenario, faults), plan, faults, actions=stop).run_until_armed(2.6)

@@ -25,7 +25,7 @@ from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import HERE
-from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -150,7 +150,7 @@ def test_the_live_window_equals_the_simulator(file_of, form):
 @pytest.mark.parametrize("form", [pytest.param("filter", marks=pytest.mark.slow), "pair"])
 def test_the_bridge_rehearses_optimal_couplings(file_of, form):
     scenario, _, path = file_of(form)
-    couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
+    couplings = certified_couplings(CouplingRequest(scenario, name=str(path)), 1, spare=0)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: couplings)
     assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
