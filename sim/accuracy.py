@@ -37,8 +37,8 @@ from haptic_loop.sim.trace import Trace
 class PositionError:
     """Error of device positions against the exact engine. Figures are None if nothing moves or a `reason` is given."""
 
-    position_relative_rms: float | None = None
-    position_max_m: float | None = None
+    position_relative_rms: float | None = None  # rms error over the rms of the exact positions
+    position_max_m: float | None = None  # largest error of a channel at a tick
     reason: str | None = off_table("if given", None)
 
 
@@ -91,9 +91,9 @@ class Row:
     integrator: str | None
     substeps: int | None
     position_relative_rms: float | None  # rms error of positions over the rms of the exact positions
-    growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling, with its sign
+    growth_rate_error: float  # [1/s] error with or without the coupling, whichever is larger in size
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
-    cycle_deviation_n: float | None  # standard deviation of one channel's force in the limit cycle without coupling
+    cycle_deviation_n: float | None  # largest standard deviation of a force in the limit cycle without coupling
     cycle_frequency_hz: float | None  # frequency of the same force
     cycle_deviation_error: float | None  # relative error of `cycle_deviation_n`
     cycle_frequency_error_hz: float | None
@@ -108,11 +108,11 @@ class _Reference:
     coupled: Simulation
     uncoupled: Simulation
     trace: Trace
-    cycle: tuple[int, float, float] | None  # channel, standard deviation [N], frequency [Hz]; None without limit cycle
+    cycle: tuple[int, float, float] | None  # channel, standard deviation [N], frequency [Hz]; None: not measured
 
 
 def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
-    """Return the exact engine's runs of the coupled loop and, if it is unstable, of the uncoupled loop."""
+    """Return the exact engine's run of the coupled loop, and the limit cycle of an unstable uncoupled loop."""
     cycle = None
     if unstable(exact_growth(uncoupled)):
         free = run(uncoupled, "exact")
@@ -164,7 +164,7 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
     """Return the rows with `pareto` set.
 
     A row is on the front if its verdicts are right, its figures are finite, and no row of the same engine is at least
-    as good in all figures and better in one. Each engine has its own front, because the exact one needs a linear plant.
+    as good in all figures and better in one. Each engine has its own front: only linear plants suit the exact engine.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -234,7 +234,7 @@ class Credible:
     Each list has one entry per channel, but for a run without ticks the lists of peaks are empty.
     """
 
-    until_s: float | None  # first time at which a transmission force or a motor speed exceeds its limit
+    until_s: float | None  # first time at which a transmission force or a motor speed exceeds its limit; None: never
     transmission_force_n: list[float | None]  # peak force of the transmission; None for a rigid device
     motor_speed_m_per_s: list[float]  # peak speed of the motor
     credible_force_n: list[float | None]  # largest force for which the model is credible
@@ -243,7 +243,7 @@ class Credible:
 
 
 def credible(simulation: Simulation, trace: Trace) -> Credible:
-    """Return whether a run stays within the forces and speeds for which the devices' linear model is credible.
+    """Return when a run leaves the forces and speeds for which the devices' linear model is credible, and its peaks.
 
     The limits are `Device.most_credible_force` and `Device.credible_speed`.
     """
@@ -340,11 +340,11 @@ def _rms(values: Array) -> float:
 
 # ---- the cheapest engine and step for a given error
 #
-# The error is the relative rms error of the encoders' positions over the run. Without friction the reference is a run
-# with the exact engine. With friction the reference is a run of RK4. Two runs, with n and with 2 n substeps, are
-# compared, and n is doubled until their difference is small enough. If every doubling multiplies the difference by q,
-# the error of the finest run is q/(1 - q) times the last difference; a method of first order has q = 1/2. Two runs may
-# agree by chance. Therefore q is the larger of the last two ratios of successive differences, and at least _EVEN.
+# The error is the relative rms error of the true positions at the encoders over the run. Without friction the reference
+# is a run with the exact engine. With friction the reference is a run of RK4. Two runs, with n and with 2 n substeps,
+# are compared, and n is doubled until their difference is small enough. If every doubling multiplies the difference by
+# q, the error of the finest run is q/(1 - q) times the last difference; a method of first order has q = 1/2. Two runs
+# may agree by chance. Therefore q is the larger of the last two ratios of successive differences, and at least _EVEN.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
@@ -430,8 +430,8 @@ class CrossCheck:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # null in JSON where a run overflowed
-    growth_rate_per_s: float
+    position_relative_rms: float  # rms difference over the rms of the repeated run; null in JSON after an overflow
+    growth_rate_per_s: float  # as `simulated_growth` with this integrator, at constant periods and delays
     growth_rate_difference_per_s: float  # the growth rate above minus that of the original run's engine
     agrees: bool  # whether the verdicts agree, and both runs diverged or neither did
 
@@ -565,12 +565,12 @@ def settle(
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     """Return the default number of steps per period: 1 for the exponential integrator without friction.
 
-    For other integrators it resolves the plant's motions and gives the right verdict. Raises InputError if no number up
+    Otherwise the steps resolve the plant's motions and give the right verdict. Raises InputError if no number up
     to 10000 suffices, or for MuJoCo's integrator `discrete`.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return least_substeps(EXPONENTIAL)
-    if integrator == "discrete":  # It has states that the map of `_agrees` lacks.
+    if integrator == "discrete":  # This integrator has states that the map of `_agrees` lacks.
         raise InputError(f"--integrator discrete gives no reliable verdict: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T

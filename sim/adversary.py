@@ -40,8 +40,8 @@ class _Pass(NamedTuple):
     """Settings of a search. Slow modes of lossless hands barely decay, and could hide faster ones that nearly grow."""
 
     links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
-    min_frequency_hz: float  # modes below it are ignored
-    held: bool = False  # one person holds all devices; body and cross spring present every reactance matrix
+    min_frequency_hz: float  # slower modes are ignored
+    held: bool = False  # whether one person holds all devices; body and cross spring present every reactance matrix
 
 
 _PASSES = (_Pass(1, 2.0), _Pass(2, 2.0), _Pass(1, 0.0), _Pass(1, 2.0, held=True))
@@ -75,7 +75,8 @@ def search(
 ) -> Worst:
     """Search for the lossless humans with the largest growth, and return them.
 
-    With `first`, the search ends once humans destabilise the loop. `progress` is called after every generation.
+    F maps positions to forces; in a loop with walls the caller chooses the set of touched walls. With `first`, the
+    search ends once humans destabilise the loop. `progress` is called after every generation.
     """
     from scipy.optimize import differential_evolution  # slow to load
 

@@ -140,8 +140,9 @@ def simulate(
         environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
             [m] that its port would have without a force, and returns the forces to feed back, (m,) [N]. An energy shell
             makes the function passive up to the energy `energy_budget`.
-        energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the energy that the shell may give (default 0,
-            in a scene START_J). Otherwise it is the energy budget of the devices; None means that they have no budget.
+        energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the energy that the shell may give, in a scene
+            beyond the energy that the scene releases (default 0, in a scene START_J). Otherwise it is the energy budget
+            of the devices; None means that they have no budget.
         limiter: False to clip forces. If True, a limiter acts where the coupling's guarantee covers a limiter, and
             forces are clipped otherwise (`meta["assessment"]["force_limits"]`).
 
@@ -241,7 +242,7 @@ def validate(
     Args:
         scenario: The loop. With walls, the verdict is for the set of touched walls with which the loop grows fastest.
         coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
-        humans: Number of sets of humans, drawn from `scenario.population`. Set i depends only on `seed` and i.
+        humans: Number of sets of humans, drawn from `scenario.population`. Set i depends on the scenario, `seed` and i.
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine). Your class makes one engine for
             each set of humans, and its results are compared with those of the exact engine.
@@ -254,8 +255,9 @@ def validate(
             limit, the lossless ones and 64 at random), or "all".
 
     Returns:
-        Findings with n = humans. `exact` and `mujoco` (n,) are growth rates [1/s], positive where a human makes the
-        loop unstable; `disagreements` (n,) says whether the engines disagree. crowds.Findings lists the other fields.
+        Findings with n = humans, or fewer if batches are missing (`interrupted`, `lost`). `exact` and `mujoco` (n,) are
+        growth rates [1/s], positive where a human makes the loop unstable; `disagreements` (n,) says whether the
+        engines disagree. crowds.Findings lists the other fields.
 
     Raises:
         InputError: A device has Coulomb friction, or the environment is a MuJoCo scene. Verdicts need linear loops.

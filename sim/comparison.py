@@ -43,7 +43,10 @@ _QUICK = 2  # largest number of channels with an optimal coupling
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One coupling in the loop, or the reason why there is none."""
+    """One coupling in the loop, or the reason why there is none.
+
+    With walls, ratio and mismatch are for all walls touched, and growth is the largest for any set of touched walls.
+    """
 
     coupling: str  # kind of the coupling
     condition: str | None  # the condition of the design; None for no coupling and for the paper's gains
@@ -205,9 +208,9 @@ class Comparison:
     psi: tuple[int, ...]
     lam: tuple[int, ...]
     available_damping: tuple[float, ...]  # (m,) [N s/m]
-    frequency_hz: Array
+    frequency_hz: Array  # (k,)
     sigma_E: Array  # (k, m) singular values of E [N/m]
-    ideal: compare.Perceived
+    ideal: compare.Perceived  # what users would feel of E itself
     couplings: list[ComparedCoupling]
     notes: list[str]
 

@@ -111,7 +111,7 @@ def stored_coupling(scenario: Scenario, name: str) -> tuple[Stored, Coupling]:
 
 
 def own_of(name: str, loop: Loop) -> Chosen:
-    """Return the coupling of a user's own function for a loop. Raises InputError if it does not fit the loop."""
+    """Return the coupling of a user's own function for a loop. Raises InputError if the coupling does not fit."""
     coupling = own_coupling(name, loop)
     called(f"--coupling {name}", fitting, loop, coupling)
     return given(coupling, name)
@@ -136,7 +136,7 @@ def read_coupling(path: str | Path) -> Stored:
 
 
 def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
-    """Return the stored coupling for a loop of `channels` at T [s]. Raises InputError if it does not fit."""
+    """Return the stored coupling for a loop of `channels` at T [s]. Raises InputError if the coupling does not fit."""
     if len(stored.loop.delta) != channels:
         raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
     coupling = stored.coupling.build(T)
@@ -154,7 +154,7 @@ def from_file(
         stored: The content of the file.
         loop: The loop in which the coupling is used.
         kind: The name of the coupling in reports.
-        own: The user's own condition. The file stores only its name, and its certificate needs the condition.
+        own: The user's own condition. The file stores only its name, but a check of the file's certificate needs it.
         coupling: The file's coupling if the caller has built it, for example for another T.
 
     Returns:

@@ -185,7 +185,7 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad], and largest decay (rate times step), in a step of RK4
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad], and largest decay (rate times step), in a step
 
 
 def least_substeps(integrator: str) -> int:
@@ -571,7 +571,7 @@ class _PlantSpeed:
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """Return the least number of RK4 steps in T seconds that resolves these motions."""
+        """Return the least number of steps of MuJoCo's integrators in T seconds that resolves these motions."""
         return max(
             least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
         )

@@ -1,8 +1,8 @@
 """Search for limit cycles of devices in human hands: eigenvalues for every human, MuJoCo for the worst human.
 
-A cell of a Z-width map has a map F from positions to forces, and a controller's process that computes F. A human is
-here a set of hands, one for each device. `HeldDevices` closes the loop of F and the devices in the hands of every
-human. `simulate_cells` runs cells in MuJoCo, with encoder steps, friction and walls.
+A cell of a Z-width map has linear maps F from positions to forces, one for each set of touched walls, and a process of
+the controller. A human is here a set of hands, one for each device. `HeldDevices` closes the loop of F and the devices
+in the hands of every human. `simulate_cells` runs cells in MuJoCo, with encoder steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -133,9 +133,9 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo. The human with whom the exact linear loop grows fastest holds the devices. Only modes that a trace
-# can show count: they oscillate fast enough, or run away. Plant and process start in this mode, scaled so that the
-# motor or handle that moves most is displaced by _START. Each hand presses with a force that starts smoothly and then
-# stays constant. The second half of the trace gives the verdict.
+# can show count: they oscillate fast enough, or run away. The plant starts in this mode, scaled so that the motor or
+# handle that moves most is displaced by _START; so does a process without walls and limiter. Each hand presses with a
+# force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest allowed force limit of a device, which no force here reaches
@@ -172,10 +172,10 @@ class Points:
     """The simulated cells, (k,) each."""
 
     cell: Cells  # flat index in the grid
-    oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace
+    oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace, or the trace diverged
     amplitude: Array  # [m] amplitude of the oscillation; inf if the trace diverged
     frequency_hz: Array  # [Hz] frequency of the oscillation; nan if the trace diverged
-    growth: Array  # [1/s] growth, in the exact loop, of the dominant mode that a trace can show
+    growth: Array  # [1/s] exact growth of the dominant mode that a trace can show, with all walls touched
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:

@@ -34,7 +34,7 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
-    """Plot K over B, and return the path: cells for the population, lines for certificates, symbols for MuJoCo."""
+    """Plot K over B, and return the path. Cells show the population, lines the certificates, and symbols MuJoCo."""
     figure = Figure((8, 5.6), layout="constrained")
     axes = figure.subplots()
     about_environment = report.fixed is not None

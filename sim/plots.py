@@ -565,7 +565,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
     """Plot each condition's required damping over frequency, the available damping, and where conditions bind."""
     from haptic_loop.design.result import ANY, TITLES
 
-    title = "required damping over frequency; o: where it binds, ^: above the picture"
+    title = "required damping over frequency; o: where a condition binds, ^: above the picture"
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping

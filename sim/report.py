@@ -231,7 +231,7 @@ class UnevenTicks:
     period_s: _Periods
     recorded: bool  # whether the periods come from a file; otherwise they are drawn at random or constant
     T_max_s: float | None  # the longest period that certificates must cover; None if every period is T
-    latency_s: tuple[tuple[float, float], ...] | None
+    latency_s: tuple[tuple[float, float], ...] | None  # (least, most) of each channel; None: forces latch at ticks
 
     @classmethod
     def of(cls, timing: Timing, scenario: Scenario) -> UnevenTicks:

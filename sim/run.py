@@ -96,7 +96,7 @@ class Simulation:
 
     @property
     def F(self) -> Lti:
-        """The map from positions to forces at constant delays while no wall is touched."""
+        """The linear map from positions to forces at constant delays while no wall is touched; 0 in a world."""
         return self.process.law.open
 
     @property

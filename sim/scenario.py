@@ -51,7 +51,7 @@ _UNSAID: Any = None  # placeholder of a default that depends on the number of ch
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A short constant force on one handle."""
 
-    channel: int  # counted from 1, over the axes of all devices
+    channel: int  # counted from 1, over the free axes of all devices
     force: float  # [N]
     start: float  # [s]
     duration: float  # [s]
@@ -225,7 +225,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lead(self) -> list[int]:
-        """For each channel, the first channel of its device. All axes share that channel's drawn delay and latency."""
+        """For each channel, the first channel of its device. A device's axes share its drawn delay and latency."""
         counts = [len(device.free) for device in self.device]
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
@@ -273,7 +273,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delay_range(self) -> DelayRange:
-        """The range of the delay of a force that is not lost."""
+        """The range of the delay [samples] of a force that is not lost."""
         varying = self.varying_delay
         return DelayRange(varying.lo, varying.hi) if varying else DelayRange(self.theta, self.theta)
 
@@ -772,7 +772,7 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     return [*plain, *({"between": spring.get("between")} | one for one in directed)]
 
 
-_DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
+_DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # direction in which a contact of a world slides without `along`
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -16,9 +16,9 @@ class Signals(NamedTuple):
     """The part of a trace that a picture shows: N samples of m channels."""
 
     t: Array  # (N,) [s]
-    x: Array  # (N, m) [m]
-    f: Array  # (N, m) [N]
-    x_handle: Array  # (N, m) [m]
+    x: Array  # (N, m) [m] displacements at the encoders
+    f: Array  # (N, m) [N] forces fed back
+    x_handle: Array  # (N, m) [m] displacements of the handles
     names: tuple[str, ...]  # (m,) names of the channels; () if they are only numbered
 
 

@@ -201,12 +201,13 @@ class Ringing:
     """How the exact loop with the scenario's hands decays after an impulse, at constant delays and without friction.
 
     A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 for a decay without oscillation.
+    Free drifts (|s| up to 0.001 1/s) do not count.
 
     Attributes:
         decay_per_s: Decay rate of the slowest mode [1/s]; negative if it grows.
         frequency_hz: Frequency of the slowest mode [Hz].
         damping_ratio: Damping ratio of the slowest mode.
-        least_damping_ratio: Least damping ratio of all modes but free drifts (|s| up to 0.001 1/s).
+        least_damping_ratio: Least damping ratio of all modes.
         least_frequency_hz: Frequency of the mode with the least damping ratio [Hz].
     """
 
@@ -420,7 +421,7 @@ _NOISE_FLOOR = 1e-8  # A mode with a smaller share of the state is noise of the 
 class ImpulseTest:
     """The results of an impulse test."""
 
-    growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan: no fit
+    growth: Array  # (nsim,) [1/s] fitted growth of the dominant mode before a force clips; nan: no fit, or walls
     error: Array  # (nsim,) [1/s] estimated error of `growth`; if it exceeds the rate, the rate's sign is uncertain
     clipped: NDArray[np.int64]  # (nsim,) number of ticks in which a force is at its limit or a limiter acts
     least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter, before the first clipped tick
@@ -453,7 +454,7 @@ class Balance:
         return buffer.f[:count] * moved, self._spent(self.damping, moved)
 
     def _spent(self, damping: Array, moved: Array) -> Array:
-        """Return the least dissipation for steps `moved` (count, m, nsim). `damping` is the diagonal of the matrix."""
+        """Return the least dissipation in steps `moved` (count, m, nsim). `damping` is diag(Delta) over their time."""
         if self.Delta is None:
             return damping * moved**2
         return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)

@@ -77,7 +77,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
-    """Return the delays (ticks, m) of run `index`: adversarial ones if `recorded` has them, otherwise random ones."""
+    """Return the delays (ticks, m) of run `index` by the scenario's pattern; `recorded` has the adversarial delays."""
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else recorded
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))

@@ -110,7 +110,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached its limit (m,) [N]; in each of `balls`, whether its vector did."""
+        """Return (N,) whether a force, or the force vector of one of `balls`, reached its limit (m,) [N]."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest frequency [Hz] from 10 Hz in the forces' last quarter; None if it is short or calm."""
+        """Return the strongest frequency [Hz] from 10 Hz in the forces' last quarter; None if that is short or calm."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -135,7 +135,7 @@ class Trace(ReadOnly):
         return Signals(self.t, self.x, self.f, self.x_handle, self.names)
 
     def to_frame(self) -> Any:
-        """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]" or, for y, "f left.y [N]".
+        """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]" or "f left.y [N]".
 
         Raises:
             ImportError: pandas is not installed.
@@ -306,8 +306,8 @@ class Growth:
     stop: int
     growth_rate_per_s: float | None = None
     error_per_s: float | None = None  # standard error of the rate
-    frequency_hz: float | None = None
-    amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
+    frequency_hz: float | None = None  # strongest frequency in the last window that shows the oscillation
+    amplitude_m: float | None = None  # amplitude in that window: root of the sum of squares over the channels
     slowest_hz: float | None = None  # frequency below which oscillations are not seen
     trend: str | None = None  # "grows" or "decays" if the rate exceeds _CLEAR standard errors, otherwise "neither"
     reason: str | None = None  # why there is no rate

@@ -51,8 +51,8 @@ class EnvironmentsMet:
 
     of: str  # "the nominal environment" or "the ranges"
     count: int  # number of environments
-    names: list[str] | None = off_table("if given", None)
-    unstable_in: list[str] | None = off_table("if given", None)
+    names: list[str] | None = off_table("if given", None)  # names of the environments of the ranges
+    unstable_in: list[str] | None = off_table("if given", None)  # names of those in which some humans are unstable
 
     @classmethod
     def met(cls, question: Validation, findings: Findings) -> EnvironmentsMet:
@@ -101,8 +101,8 @@ class DrawnHumans:
     index: int
     human: list[dict[str, Any]]
     person: tuple[Person, ...]
-    environment: str | None = off_table("if given", None)
-    network: Network | None = off_table("if given", None)
+    environment: str | None = off_table("if given", None)  # name of an environment of the ranges
+    network: Network | None = off_table("if given", None)  # this environment
     device: Sequence[Mechanics] | None = off_table("if given", None)  # mechanics drawn within the guaranteed bounds
 
     @classmethod
@@ -147,7 +147,7 @@ class Traces:
     undecided: int  # number of traces too short for the sign of their rate; eigenvalues decide there
     largest_difference_per_s: float | None  # largest difference of growth rates between a trace and its exact loop
     stable_and_settling: int  # number of stable loops with slower handles in the last quarter than in the second one
-    stable: int
+    stable: int  # number of stable loops
     slowest_settling: float | None  # largest ratio of late to early speeds of the handles of a stable loop
     slowest_decay_s: float | None  # decay time of the slowest mode that decays
     settling_decides: bool  # whether the traces are long enough for handles to slow down

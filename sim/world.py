@@ -45,7 +45,7 @@ class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
     given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
-    port_least_J: float  # least energy that had entered by any tick: sum of f'(u[k] - u[k-1]), contact positions u
+    port_least_J: float  # least energy that had entered the scene by any tick: sum of f'(u[k] - u[k-1]), contacts at u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # bound on the energy that constraints created (the lemma on MuJoCo worlds in docs/theory.md)
     unsettled_steps: int  # number of steps whose limited forces did not settle in the allowed repetitions
@@ -313,8 +313,8 @@ _STREAM = 11  # random stream of these draws, independent of the hands' stream w
 class HandsInWorld:
     """Energy figures of one set of hands in a world, after a start with random speeds."""
 
-    kind: str
-    number: int
+    kind: str  # RANDOM or LOSSLESS
+    number: int  # index of the set, from 0
     figures: WorldFigures
 
     @property

@@ -57,7 +57,7 @@ class _Sweep(ABC):
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of a condition at one point. It is computed apart from the map, and can check it."""
+        """Return the requirement of a condition at one point, computed apart from the map, to check the map."""
 
     @cached_property
     def judges(self) -> dict[str, Condition]:
@@ -125,7 +125,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,). With walls it is for contact that makes and breaks.
+        """Return required over available damping (n,); with walls, for contact that makes and breaks.
 
         The ratio is inf if the condition does not apply, or if no damping is enough.
         """
@@ -330,7 +330,7 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
         raise InputError(f"{option} begins at 0, which a logarithmic map cannot show: choose a lower end above 0")
 
 
-_SLICE = 60  # number of cells whose ratios are computed together; with walls it is 1
+_SLICE = 60  # number of cells whose ratios are computed together; 1 with walls
 _SAMPLE = 25  # number of cells that decide which humans are tried first (`HeldDevices.leading`)
 
 
@@ -441,7 +441,7 @@ _HALVINGS = 20  # bisections, which give an edge of the population with a relati
 
 @dataclass(frozen=True)
 class Mark:
-    """One point, and the largest safe K at its B: None if no tried K is safe, inf if the largest tried K is safe."""
+    """One point, and the largest safe K at this B: None if no tried K is safe, inf if the largest tried K is safe."""
 
     K: float  # [N/m]
     B: float  # [N s/m]

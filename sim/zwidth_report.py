@@ -41,9 +41,9 @@ class _Population:
 
     humans: int
     seed: int
-    growth_rate_per_s: Array  # (rows, columns)
+    growth_rate_per_s: Array  # (rows, columns) largest over the humans tried in a cell
     unstable_humans_at_least: Array  # (rows, columns) number of unstable ones among the humans tried in a cell
-    stable_cells: int
+    stable_cells: int  # number of cells in which no human is unstable
     decided_cells: int  # number of cells with figures; after an interruption fewer than all
     reason: str | None = off_table("if given")
 
@@ -52,8 +52,8 @@ class _Population:
 class Shown:
     """The nonlinear effects in the simulation of cells."""
 
-    encoder_step_m: list[float]
-    friction_n: list[float]
+    encoder_step_m: list[float]  # of each device, the largest of its axes
+    friction_n: list[float]  # of each device, the largest of its axes
     walls: bool
 
 
@@ -66,7 +66,7 @@ class _Point:
     verdict: str
     amplitude_m: float
     frequency_hz: float
-    linear_growth_rate_per_s: float
+    linear_growth_rate_per_s: float  # exact growth of the simulated mode, with all walls touched
     differs_from_linear: bool
 
 
@@ -77,9 +77,9 @@ class _Marked:
     K: float  # [N/m]
     B: float  # [N s/m]
     requirements: dict[str, Requirement] = off_table("inlined")
-    growth_rate_per_s: float = off_table()
+    growth_rate_per_s: float = off_table()  # largest over the humans
     unstable_humans: int = off_table()
-    stiffest_K_at_this_B: dict[str, float | str | None] = off_table()
+    stiffest_K_at_this_B: dict[str, float | str | None] = off_table()  # condition or "population" -> K [N/m] or words
 
     @classmethod
     def of(cls, mark: Mark) -> _Marked:
@@ -157,7 +157,7 @@ class _Simulated:
 class MapReport:
     """The report of a map. An array's rows are stiffnesses. Null means infinite, not applicable, or not computed."""
 
-    rigid: bool
+    rigid: bool  # whether the first device alone faces a rigid wall
     scenario: str | None
     scenario_digest: str
     T: float

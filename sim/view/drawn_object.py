@@ -155,7 +155,7 @@ class _Motion:
         self._nodes, self._next = self._after[self._m : ports, 0], self._after[ports:]
 
     def rest(self, x: Array) -> Array:
-        """Start in the equilibrium without contact for devices at x (m,) [m]; return displacements (nodes,) [m]."""
+        """Start in equilibrium, no wall touched, with devices at x (m,) [m]; return displacements (nodes,) [m]."""
         self._z[:, 0] = self._law.at_rest(np.concatenate([x, np.zeros(self._nodes.size)]))
         self._x[:] = x
         self._tick(self._before, self._after)
