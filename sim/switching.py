@@ -6,7 +6,7 @@ xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: the plant, the controller's bl
 the forces g_i that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
-[lo, hi] allow several forces; each device receives that force which gives it the most power -f v. An age grows by
+[lo, hi] allow several forces; each device receives that force which gives it the most power -f'v. An age grows by
 at most one per tick, because a device holds its newest force. Candidates for the worst period are windows of this
 sequence that may be repeated, and constant delays at the ends of their ranges. The worst candidate is the one whose
 product of mode matrices grows fastest per tick. A spectral radius of this product above 1 proves instability.
@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +73,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
     plant, process = simulation.plant, simulation.process
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
     ages = _greedy_ages(process, one, simulation.scene, varying, _SEARCHED)
-    return _worst_period(ages[:, :, 0], plant, process.law.sent, varying)
+    return _worst_period(ages[:, :, 0], plant, process.law.sent, varying, simulation.scenario.lead)
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
@@ -112,7 +112,7 @@ def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[
 
 
 def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
-    """Return ages (ticks, m, nsim) that feed energy into the linear loop of every plant."""
+    """Return ages (ticks, m, nsim) that feed energy into the linear loop of every plant; a device's axes share them."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
     m, law = process.channels, process.law.without_theta
     free = replace(process, law=law, force_limit=np.full(m, np.inf), delays=None)
@@ -124,13 +124,15 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
     sent, age = np.zeros((depth, m, nsim)), np.broadcast_to(hi, (m, nsim))
     candidate, row, column = np.arange(depth)[:, None, None], np.arange(m)[:, None], np.arange(nsim)
+    first, device = np.unique(scene.devices, return_index=True)[1], list(scene.devices)
     ages = np.empty((ticks, m, nsim), dtype=np.int64)
     for k in range(ticks):
         buffer.w[0] = pushed[k][:, None]
         buffer.tick(0)
         sent = np.concatenate([buffer.f[0][None], sent[:-1]])  # sent[n] left n ticks ago
         allowed = (candidate >= lo) & (candidate <= np.minimum(hi, age + 1))
-        age = np.argmin(np.where(allowed, sent * buffer.s[0][nv : nv + m], np.inf), axis=0)
+        taken = np.add.reduceat(sent * buffer.s[0][nv : nv + m], first, axis=1)[:, device]
+        age = np.argmin(np.where(allowed, taken, np.inf), axis=0)
         buffer.f[0] = sent[age, row, column]
         engine.advance(0)
         buffer.rewind(1)
@@ -143,13 +145,17 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
     return ages
 
 
-def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
-    """Return the period that grows fastest if it repeats: part of `ages` (ticks, m), or constant delays lo or hi."""
+def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay, lead: Sequence[int]) -> Period:
+    """Return the period that grows fastest if it repeats: part of `ages` (ticks, m), or constant delays lo or hi.
+
+    `lead` has for each channel the first channel of its device, whose delay all axes of the device share.
+    """
     ticks = ages.shape[0]
     matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
     starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
-    ends = [np.array([row]) for row in product(*zip(varying.lo, varying.hi, strict=True))][:_MOST_ENDS]
+    sides = [{lo, hi} if i == lead[i] else {lo} for i, (lo, hi) in enumerate(zip(varying.lo, varying.hi, strict=True))]
+    ends = [np.array([row])[:, lead] for row in islice(product(*map(sorted, sides)), _MOST_ENDS)]
     for window in [*(ages[start : start + _LONGEST_PERIOD] for start in starts), *ends]:
         products, scale = _running_products([matrix(*row) for row in window.tolist()])
         radius = np.abs(np.linalg.eigvals(products)).max(axis=1)

@@ -229,6 +229,20 @@ def validated(tmp_path, *options):
     return code, json.loads((tmp_path / "v.json").read_text())["switching"]
 
 
+def test_axes_of_a_device_share_the_worst_delays():
+    """A packet holds the forces of all axes: the run's ages repeat those of the period whose growth is reported."""
+    scenario = load("omega-space").replace(varying_delay={"lo": [0, 1], "hi": [3, 4], "pattern": "adversarial"})
+    switched, period = switching(assemble(scenario, NoCoupling()), 0, 400)
+    met, length = ages(switched.process.delays)[..., 0], len(period.ages)
+    assert (period.ages == period.ages[:, scenario.lead]).all()
+    assert met[2 * length : 3 * length].tolist() == period.ages.tolist()
+    both = np.concatenate([switched.plant.A[None]] * 2), np.concatenate([switched.plant.B[None]] * 2)
+    held = HeldPlant(*both, switched.plant.C, switched.plant.T)
+    greedy = _greedy_ages(switched.process, held, switched.scene, scenario.varying_delay, 200)
+    assert (greedy == greedy[:, scenario.lead]).all()
+    assert (greedy[:, 0] != greedy[:, 3]).any()
+
+
 @pytest.mark.validate
 def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
     """The design for constant delays is unstable with 10 or more of 20 humans, that for switching delays with none."""
