@@ -277,7 +277,7 @@ def _feel(report: Comparison) -> render.Table:
         return [float(np.interp(hz, report.frequency_hz, column, right=np.nan)) for column in curves.T]
 
     rows = [[name, *(_list(at(hz, getattr(felt, what))) for what, _, hz in columns)] for name, felt in named.items()]
-    return render.grid("perceived by each device's user, the other devices held still", heads, rows)
+    return render.grid("perceived on each channel, the other channels held still", heads, rows)
 
 
 def _list(values: Iterable[float]) -> str:

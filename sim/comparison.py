@@ -213,6 +213,7 @@ class Comparison:
     ideal: compare.Perceived  # what users would feel of E itself
     couplings: list[ComparedCoupling]
     notes: list[str]
+    names: tuple[str, ...] = off_table("left out", ())  # (m,) names of channels if devices have several axes; else ()
 
     @property
     def conditions(self) -> list[str]:
@@ -244,4 +245,4 @@ class Comparison:
         for c in couplings:
             notes += [f"{c.name}, {name}: {each.reason}" for name, each in c.conditions.items() if each.reason]
         about = case, scenario.name, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
-        return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)
+        return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes, scenario.channel_names)

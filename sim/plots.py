@@ -595,8 +595,8 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
 
 
 def plot_perceived(report: Comparison, path: Path) -> Path:
-    """Plot the stiffness and the damping that each user feels, beside those of E itself."""
-    title = "felt by each user, the other devices held still; vertical axes are linear near zero"
+    """Plot the stiffness and the damping that users feel on each channel, beside those of E itself."""
+    title = "felt on each channel, the other channels held still; vertical axes are linear near zero"
     figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
     hz = report.frequency_hz
     curves = [("ideal: E itself", report.ideal, _IDEAL)]
@@ -612,8 +612,8 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
             typical = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
             axis.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(typical)))
         row[0].set_ylabel(label)
-    for i, (upper, lower) in enumerate(axes.T, start=1):
-        upper.set_title(f"device {i}")
+    for i, (upper, lower) in enumerate(axes.T):
+        upper.set_title(report.names[i] if report.names else f"device {i + 1}")
         lower.set_xlabel("frequency [Hz]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 4)

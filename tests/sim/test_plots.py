@@ -187,12 +187,12 @@ def coupling(name, ratio, at, delayed):
     return SimpleNamespace(name=name, conditions=conditions, curves=curves)
 
 
-def report(available=(1.37, 1.37), psi=(0, 0)):
+def report(available=(1.37, 1.37), psi=(0, 0), names=()):
     felt = SimpleNamespace(stiffness=np.full((3, 2), 2.0), damping=np.zeros((3, 2)))
     couplings = [coupling("soft", 0.5, 100.0, any(psi)), coupling("stiff", 40.0, 0.0, any(psi))]
-    data = {"frequency_hz": HZ, "available_damping": available, "psi": psi, "ideal": felt}
-    names = list(couplings[0].conditions)
-    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=names)
+    data = {"frequency_hz": HZ, "available_damping": available, "psi": psi, "ideal": felt, "names": names}
+    conditions = list(couplings[0].conditions)
+    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=conditions)
 
 
 def test_binding_frequencies_are_marked(undrawn):
@@ -221,6 +221,9 @@ def test_drawn_curves_are_the_reported_ones(undrawn):
     np.testing.assert_array_equal(lines(figure.axes[0])["soft"], np.transpose([HZ, [1.0, -5.0, 7.0]]))
     np.testing.assert_array_equal(lines(figure.axes[3])["stiff"], np.transpose([HZ, [2.0] * 3]))
     assert legend(figure) == ["ideal: E itself", "soft", "stiff"]
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["device 1", "device 2"]
+    figure = undrawn(plots.plot_perceived, report(names=("left.x", "left.y")))
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["left.x", "left.y"]
 
 
 def k_b_map():
