@@ -17,7 +17,7 @@ from haptic_loop.models.human import Hand, Human, Person
 from haptic_loop.sim.adversary import Worst
 from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
-from haptic_loop.sim.stability import unstable
+from haptic_loop.sim.stability import disagree, unstable
 
 _SETTLING = 4  # duration of a trace, in decay times of the slowest mode, from which its handles must slow down
 _ROUNDING = 1e-9  # size of an energy W(N) < 0 (sim.crowds) that is rounding, relative to the sizes of its terms
@@ -77,6 +77,9 @@ def disagreement_words(question: Validation, findings: Findings) -> str:
         rates = f"exact {findings.exact[k]:+.3g} 1/s, {engine} {findings.mujoco[k]:+.3g} on its map"
         if findings.trace_decides[k]:
             rates += f" and {findings.trace[k]:+.3g} ± {findings.trace_error[k]:.2g} on its trace"
+        switching, own = findings.switching[k], findings.switching_mujoco[k]
+        if disagree(switching, own):
+            rates += f"; exact {switching:+.3g}, {engine} {own:+.3g} while delays or ticks vary"
         index = int(findings.index[k])
         replay = (
             f"; repeat: sim.run --human disagreement-{index}.toml --error 1e-6" if question.can_store(index) else ""

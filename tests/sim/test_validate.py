@@ -565,3 +565,6 @@ def test_inaccurate_traces_are_no_disagreement():
     for part in ("index 1", "exact -0.331 1/s", "MuJoCo +0.2 on its map", "--human disagreement-1.toml"):
         assert part in words
     assert "trace" not in words
+    assert "vary" not in words
+    varying = replace(slow, switching=np.full(4, -0.3), switching_mujoco=np.array([-0.3, -0.3, 0.1, -0.3]))
+    assert "; exact -0.3, MuJoCo +0.1 while delays or ticks vary" in disagreement_words(question, varying)
