@@ -380,7 +380,7 @@ def compare_engines(
     """Run each setting that is stable on the scene's plant for `ticks` ticks; return the settings, the cheapest first.
 
     Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
-    constant delays without the layer. Every run calls `progress`.
+    constant delays and periods, without latency and layer. Every run calls `progress`.
 
     Raises InputError if `error` is not positive or if nothing moves. With friction it is also raised if RK4 with 128
     substeps misses `error`, or if the runs would need more than 60 million evaluations of the dynamics.

@@ -143,7 +143,7 @@ class _Budgeted:
         self._budget, self._guarantee, self._late, self._oldest = budget, guarantee, late, oldest[:, None]
         self._within, self._dropped = process.applied, 0
         self._x: Array | None = None  # positions [m] at the tick before
-        self._acted: Array | None = None  # forces [N] that acted since then
+        self._acted: Array | None = None  # forces [N] that acted since that tick
 
     def send(self, x: Array, force: Array, /) -> None:
         moved = np.zeros_like(x) if self._x is None else x - self._x

@@ -262,7 +262,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def switches(self) -> bool:
-        """Whether the delay of the forces differs from theta at some tick."""
+        """Whether the delay of the forces may differ from theta."""
         return self.varying_delay is not None and not self.varying_delay.steady
 
     @property
@@ -372,7 +372,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lever(self) -> float:
-        """The radius [m] at which a hand holds a rotary device, which converts N to N m; 1 for other devices."""
+        """The radius [m] at which a hand holds a rotary device, which converts N to N m; 1 without `radius`."""
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:

@@ -330,9 +330,9 @@ class Stability(Eigenvalues):
     """The verdicts of the trace and of the exact loop's eigenvalues; with walls, of the worst frozen loop."""
 
     verdict: str | None  # verdict on the run; None if nothing decides it
-    clipped_ticks: int
+    clipped_ticks: int  # number of ticks in which a force is at its limit
     growth_rate_per_s: float | None  # of the trace; of the linear loop if delays or ticks vary; `reason` explains None
-    frequency_hz: float | None  # strongest frequency of the forces at the end of the trace
+    frequency_hz: float | None  # strongest frequency of the forces' last quarter, from 10 Hz; None: short or calm
     contact: _Contact | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
 

@@ -340,7 +340,7 @@ class Map:
 
     grid: Grid
     ratio: dict[str, Array]  # condition -> required over available damping
-    growth: Array  # [1/s] worst over the tried humans (`_population`)
+    growth: Array  # [1/s] worst over the tried humans (`_population`) and the sets of touched walls
     unstable: Array  # number of tried humans that make the cell unstable
     points: limit_cycles.Points  # results of MuJoCo in a few cells
     seconds: dict[str, float]  # wall time of each stage
@@ -446,7 +446,7 @@ class Mark:
     K: float  # [N/m]
     B: float  # [N s/m]
     requirement: dict[str, Requirement]
-    growth: float  # [1/s] worst over the population
+    growth: float  # [1/s] worst over the population and the sets of touched walls
     unstable: int  # number of humans that make the loop unstable
     stiffest: dict[str, float | None]  # condition, or "population" -> largest safe K [N/m]
 
