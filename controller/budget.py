@@ -288,8 +288,8 @@ class Shell(_Net):
 
     W[k+1] = W[k] + f'(u - u_-), where u_- is u of the previous tick, and f = s f_wanted with the largest s in [0, 1]
     for which W[k+1] >= 0. V responds within the tick by its direct part D_V: u = u0 - D_V f, where u0 is u for f = 0.
-    Then sum f'(u - u_-) >= -W0 at every tick. With a coupling that is certified for any environment and psi = 0 the
-    loop is safe. A tick is a call of `free`, then of `limit`.
+    Then sum f'(u - u_-) >= -W0 at every tick. If the coupling is certified for any environment with psi = 0,
+    passive hands therefore receive at most W0. A tick is a call of `free`, then of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:

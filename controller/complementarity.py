@@ -351,7 +351,7 @@ class _BallBlock:
         return u
 
     def _bisected(self, q: Array) -> tuple[Array, Array]:
-        """Return (v, f) of one vector by bisection: |f| = limit, where f = (I + lam M)^-1 q gets shorter with lam."""
+        """Return (v, f) of one vector by bisection: |f| = limit, f = (I + lam M)^-1 q, shorter for larger lam."""
         one, limit = np.eye(len(q)), self.limit[0]
         excess = np.linalg.norm(q, axis=0) / limit - 1
         low, high = excess / np.linalg.norm(self.M, 2), excess / np.linalg.eigvalsh((self.M + self.M.T) / 2)[0]

@@ -167,7 +167,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
         return np.where(lost, LOST, np.array(self.hi) if self.playout else delays)
 
-    def _delays(self, rng: np.random.Generator, ticks: int, recorded: ArrayLike | None) -> Ticks:
+    def _delays(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None) -> Ticks:
         lo, hi = np.array(self.lo), np.array(self.hi)
         match self.pattern:
             case "random":
@@ -178,9 +178,9 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             case "recorded":
                 return np.resize(np.array(self.recorded, dtype=np.int64), (ticks, lo.size))
             case "constant" | "adversarial":
-                if recorded is None:
-                    raise ValueError(f"the {self.pattern} pattern depends on the loop: give its delays")
-                return np.resize(np.asarray(recorded, dtype=np.int64), (ticks, lo.size))
+                if given is None:
+                    raise ValueError(f"the {self.pattern} pattern needs the delays of the loop: pass them as `given`")
+                return np.resize(np.asarray(given, dtype=np.int64), (ticks, lo.size))
 
     def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
         """Return whether each packet (ticks, m) is in a burst. Calms and bursts alternate, with geometric lengths."""

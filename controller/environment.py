@@ -49,15 +49,15 @@ _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice ch
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Scale a direction to length 1. Raises ValueError unless all sizes are below 1e9 and one is above 1e-9."""
+    """Scale a direction to length 1. Raises ValueError unless its largest entry is between 1e-9 and 1e9 in size."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
-        raise ValueError(f"{field} is {list(direction)}, expected sizes below 1e9, at least one above 1e-9")
+        raise ValueError(f"{field} is {list(direction)}, expected components below 1e9 in size, one of them above 1e-9")
     length = float(np.linalg.norm(direction))
     return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
 
 
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A spring and a damper in parallel between two nodes or two points with several coordinates.
+    """A spring and a damper in parallel between two nodes, or between two points with several coordinates.
 
     Between points the spring acts on every coordinate, or in the direction `along` only.
     """
@@ -83,7 +83,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A one-sided spring-damper that pushes the first node back once it is `gap` beyond the second (controller.law).
+    """A one-sided spring-damper that pushes only while its first node is more than `gap` beyond the second.
 
     Between points with several coordinates the distance counts along `normal`, the direction into the wall.
     """
@@ -186,7 +186,7 @@ def _correction(block: Block) -> Any:
     E(1) is symmetric and positive semidefinite and He [(1 - z) E] = |1 - z|^2 He [E z/(z-1)] >= 0. Without the pole at
     z = 1 the condition is He H >= 0 on the whole circle for
     H = E(1)/2 - C (I-A)^-1 B - C (I-A)^-1 A (zI-A)^-1 B. A spring of l N/m beside the block adds l/2 to H.
-    Objects at the edge of passivity, such as a free mass, get a spring that covers the error bound.
+    Objects at the edge of passivity, such as a free mass, get a spring that covers the error bound of this check.
     """
     T = rational(block.T)
     A, B, C, D = (numbers(part, T) for part in block._arrays())
@@ -316,7 +316,7 @@ class _NoModel(SingularLoop):
 
 
 class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A MuJoCo scene instead of a network. It has no known E(z), which this-environment and known-device need."""
+    """A MuJoCo scene instead of a network. The conditions this-environment and known-device do not apply to it."""
 
     file: str  # MJCF
     digest: str  # SHA-256 over the names and contents of the scene's files

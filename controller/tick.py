@@ -63,7 +63,7 @@ class Process(ReadOnly):
     law: Law  # with the constant delays of the loop
     force_limit: Array  # (m,) [N], inf without a limit
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
-    delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
+    delays: Ticks | None = None  # (ticks, m, nsim or 1) packet delays [samples] in place of Theta; None: constant
     net: Callable[[int], Net] | None = None  # makes a passivity layer for a number of simulations
     balls: tuple[slice, ...] = ()  # neighbouring channels with one limit for the length of their force vector
 
@@ -169,8 +169,8 @@ class StepBuffer:
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
         #: Whether the next block first runs without limits (`linear_until` then checks its forces). This requires a
-        #: single simulation without encoder steps, walls, packets and net. It is False after a block that exceeded a
-        #: limit, until `rewind` finds all forces of a block below their limits.
+        #: single simulation without encoder steps, walls, packets and net. After a block that exceeded a limit the flag
+        #: is False, until `rewind` finds all forces of a block below their limits.
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
         for ball in process.balls:  # No vector within this box is longer than the limit.

@@ -137,5 +137,5 @@ def test_impossible_ranges_are_refused(fields, message):
 
 @pytest.mark.parametrize("pattern", ["constant", "adversarial"])
 def test_patterns_of_the_loop_need_its_delays(pattern):
-    with pytest.raises(ValueError, match="give its delays"):
+    with pytest.raises(ValueError, match="pass them as `given`"):
         VaryingDelay((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
