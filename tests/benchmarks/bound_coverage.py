@@ -4,8 +4,8 @@ PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some min
 
 Every case draws a device from its own seed; every fourth is compliant, the others are rigid. Mass is 0.1 to 0.5 kg,
 viscous friction 0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (0 in a fifth of the cases). Encoder steps are 1 to 20 um
-with a random origin; half of the cases have white noise of 0.2 or 0.4 steps. The excitation is that of hw.identify,
-without the swing and the sweep with the swing's force.
+with a random origin; half of the cases have white noise of 0.2 or 0.4 steps. The excitation is that of hw.identify
+without its swing, and without the long cosine that follows the swing.
 """
 
 from __future__ import annotations
@@ -98,17 +98,17 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
     for c, estimate, seconds in results:
         longest = max(longest, seconds)
         kind = "rigid" if c.rigid else "compliant"
-        what = f"{c.seed:4d} {kind:9s} m {c.mass:.3f} b {c.viscous:.3f} c {c.coulomb:.4f} {1e6 * c.step:5.1f} um"
+        what = f"{c.seed:4d} {kind:9s} {c.mass:.3f} kg, {c.viscous:.3f} N s/m, {c.coulomb:.4f} N, {1e6 * c.step:.1f} um"
         if isinstance(estimate, str):
             none += 1
-            print(f"{what} noise {c.noise}: none: {estimate}", flush=True)
+            print(f"{what}, noise {c.noise}: no bound: {estimate}", flush=True)
             continue
         excess.append(100 * (estimate.delta / c.viscous - 1))
         scaled.append((estimate.viscous - c.viscous) / estimate.friction.errors["viscous"])
         off = 100 * (estimate.viscous / c.viscous - 1)
-        print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
+        print(f"{what}, noise {c.noise}: viscous {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
     over = sum(e > 0 for e in excess)
-    print(f"{len(excess)} bounds, {over} above the truth; no bound in {none} cases; bound less truth:")
+    print(f"{len(excess)} bounds, {over} above the truth; no bound in {none} cases; bound minus truth:")
     print(f"largest {max(excess):+.3f} %, median {np.median(excess):+.2f} %, least {min(excess):+.2f} %")
     print(f"errors over standard errors: mean {np.mean(scaled):+.2f}, deviation {np.std(scaled):.2f}")
     print(f"longest case {longest:.1f} s")

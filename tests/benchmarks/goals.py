@@ -86,7 +86,7 @@ def engines() -> Iterator[Sequence[str]]:
             bare = [raw(simulation, *setting[1:], exact, view) for view in (np.asarray, memoryview) if setting[1]]
             used[name].append((spent, *(spent / np.array(bare or [np.nan] * 2))))
     slow = np.array(used["RK4 x 4"])[:, 0]
-    yield "engine", "CPU", "as fast as RK4 x 4", "loop / raw", "raw by memoryview", "position error", "growth error"
+    yield "engine", "CPU", "as fast as RK4 x 4", "loop / raw", "loop / memoryview", "position error", "growth error"
     for name, (_, integrator, count) in settings.items():
         times, ratios, least = np.array(used[name]).T
         trace = looped(simulation, *settings[name])

@@ -72,7 +72,7 @@ def main() -> None:
         missed += not optimum.proved
         delays = f"{','.join(map(str, loop.theta))}/{','.join(map(str, loop.psi))}"
         kind, told = type(optimum.coupling).__name__, optimum.reason or "proved"
-        figures = f"{reached:8.2f} dB, bound {least:8.2f}, g {optimum.g:.3f}"
+        figures = f"{reached:8.2f} dB, bound {least:8.2f}, rendered stiffness {optimum.g:.3f}"
         print(
             f"{number:5d} {delays:16s} {figures} {kind:13s} {optimum.states:4d} states {seconds:5.1f} s  {told}",
             flush=True,

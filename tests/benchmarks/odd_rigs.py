@@ -19,7 +19,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
-#: rig -> error of the bound that an earlier fit gave, of one mass with Coulomb friction; it refused the other rigs
+#: rig -> error of the bound by an earlier fit, which assumed one mass with Coulomb friction and refused other rigs
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")
@@ -189,16 +189,16 @@ def main() -> None:
         results = list(pool.map(judged, many, x.T, [signal] * len(many)))
     off, longest = [], max(seconds for _, seconds in results)
     for i, (rig, (estimate, _)) in enumerate(zip(many, results, strict=True), start=1):
-        before = "" if rig.name.startswith("mixed") else f" (earlier: {EARLIER.get(rig.name, 'none')})"
+        before = "" if rig.name.startswith("mixed") else f" (earlier: {EARLIER.get(rig.name, 'no bound')})"
         if isinstance(estimate, str):
-            print(f"{i:2d} {rig.name}: none: {estimate}{before}")
+            print(f"{i:2d} {rig.name}: no bound: {estimate}{before}")
             continue
         off.append(100 * (estimate.delta / rig.viscous - 1))
         b = 100 * (estimate.viscous / rig.viscous - 1)
-        print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
+        print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, viscous {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
     above, none = sum(part > 0 for part in off), sum(part == -100 for part in off)
     print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, and {none} bounds of 0")
-    print(f"median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
+    print(f"bound minus truth: median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
 
 
 if __name__ == "__main__":

@@ -2,11 +2,11 @@
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
-`before` is the rms mismatch [dB] of an older version's optimal coupling, or the reason why there was none. `to beat` is
-the goal for the rms mismatch and the rendered stiffness g. Seconds are CPU seconds. `need` is the required over the
-available damping; `at 10 %` is the largest such ratio when one spring, all springs or one mass of the environment
-change by 10 %. `gain` is the high-frequency gain (design/transparency.py), and `limited` the rms mismatch [dB] of the
-design with a limiter, if that design is proved.
+`before` is the rms mismatch [dB] of an older version's optimal coupling, or the reason why there was none; `now` is
+that of this version. `to beat` is the goal for the rms mismatch and the rendered stiffness g. `s` and `bound s` are
+CPU seconds. `need` is the required over the available damping; `at 10 %` is the largest such ratio when one spring, all
+springs or one mass of the environment change by 10 %. `gain` is the high-frequency gain (design/transparency.py), and
+`limited` the rms mismatch [dB] of the design with a limiter, if that design is proved.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def designed(path: Path) -> float | None:
 
 
 def best(path: Path) -> dict[str, float | None]:
-    """Return figures of the best certified optimal or spring-damper coupling, and the bound, None for known devices."""
+    """Return figures of the best certified optimal or spring-damper coupling; known devices have no bound (None)."""
     loop, reached = load(path).loop("I"), []
     switching = {"switching": (loop.varying_delay.lo, loop.varying_delay.hi)} if loop.varying_delay else {}
     kinds = [("optimal", name) for name in KINDS["optimal"].conditions]

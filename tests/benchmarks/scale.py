@@ -1,4 +1,4 @@
-"""Measure CPU seconds of one core for many devices, delays, hands and seconds, beside the results.
+"""Measure CPU seconds of one core, and results, for growing numbers of devices, delays, hands and seconds.
 
 PYTHONPATH=.:tests python tests/benchmarks/scale.py [devices|commands|delays|hands|duration ..]
 """

@@ -62,4 +62,4 @@ def _stopped(counts: list[int], applied: list[int], step: float) -> bool:
 
 if __name__ == "__main__":
     stopped, changing = still_holds(int(sys.argv[1]) if sys.argv[1:] else 10_000)
-    print(f"{stopped} stopped; in {changing} the force changed by more than 1 N")
+    print(f"{stopped} holds were stopped; in {changing} holds the force changed by more than 1 N")

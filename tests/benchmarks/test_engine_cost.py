@@ -191,5 +191,5 @@ def test_long_periods_stay_exact(benchmark):
         lambda: _measured_hold(simulation, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
     )
     error = np.abs(step.A - hold(plant(simulation.scene.model), T).A).max() / np.abs(step.A).max()
-    print(f"\none step of {T} s, {turns:.0f} rad of the fastest mode: map within {error:.1e}")
+    print(f"\none step of {T} s, {turns:.0f} rad of the fastest mode: relative error {error:.1e}")
     assert error < 1e-9

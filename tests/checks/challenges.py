@@ -1,9 +1,9 @@
 """Attack guarantees for limited forces, budgets, walls and encoder steps, as a part of `make validate`.
 
-The devices of a random loop get a little more or much less damping (or friction) than its guarantee requires. Then two
-adversaries try to take energy out of the loop, from rest. One moves the devices by waves, by noise, and at every tick
-by the step that takes the most energy. The other draws pushed lossless hands, selects those whose motion grows most,
-and varies them. A guarantee says that the energy balance
+The devices of a random loop get a little more or much less damping (or friction) than a guarantee requires. Then two
+adversaries try to take energy out of the loop. One moves the devices from rest, by waves, by noise, and at every tick
+by the step that takes the most energy. The other draws lossless hands with initial speeds, selects those whose motion
+grows most, and varies them. A guarantee says that the energy balance
 
         sum f'dx + dx' Delta dx/T + w'|dx|  >=  -given
 
@@ -207,7 +207,7 @@ _PARTS = 6  # parts of a tick; friction acts anew in each
 
 
 class _Rubbing:
-    """An engine with Coulomb friction, which in each part of a tick stops a device or, if it is too weak, slows it."""
+    """An engine with Coulomb friction. In each part of a tick the friction stops a device or, if too weak, slows it."""
 
     def __init__(self, plants: HeldPlant, friction: Array) -> None:
         self._A, self._B, self._most = plants.A, plants.B[..., -len(friction) :], friction.T[..., None]
@@ -253,9 +253,9 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
-    """Return a case of any-environment: a limiter with rho = 0, and walls with dampers that make and break contact.
+    """Return a case of any-environment's damping: a limiter with rho = 0, and damped walls that make and break contact.
 
-    Of eight random loops it takes the one whose own environment needs the largest share of any-environment's damping.
+    The loop is the one of eight random loops in which this-environment requires the largest share of this damping.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:

@@ -251,11 +251,11 @@ CASES = (
     ),
     # faults that the test at the end must find
     *(
-        Fault(f"{what} of axis {axis} dies, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}@0.6",), **_ENDED)
+        Fault(f"{what} of axis {axis}, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}@0.6",), **_ENDED)
         for axis in (1, 2)
         for what, fault, cause in (
-            ("motor", "motor=0", "no answer at the end:"),
-            ("sign", "motor=-1", "wrong sign:|speed:|(dead|still) encoder:|no answer at the end:|clipped"),
+            ("dead motor", "motor=0", "no answer at the end:"),
+            ("reversed motor", "motor=-1", "wrong sign:|speed:|(dead|still) encoder:|no answer at the end:|clipped"),
         )
     ),
     *(
@@ -302,7 +302,7 @@ CASES = (
             ("dead zone of 0.1 N", "zone=0.1", f"dead zone: {axis} 0."),
             ("dead zone of 0.3 N", "zone=0.3", f"dead zone: {axis} 0."),
             ("half of negative counts", "lose=0.5", f"one-sided encoder: {axis}"),
-            ("negative counts twice", "lose=2", f"one-sided encoder: {axis}"),
+            ("negative counts doubled", "lose=2", f"one-sided encoder: {axis}"),
         )
     ),
     *(
@@ -323,7 +323,7 @@ CASES = (
         )
     ),
     *(
-        Fault(f"motor 2 makes {part} of force 1, too", G.FINISHED, "", (f"cross={part}",), **_UNFOUND)
+        Fault(f"motor 2 adds {part} of motor 1's force", G.FINISHED, "", (f"cross={part}",), **_UNFOUND)
         for part in (0.2, -0.2)
     ),
     # more faults that are found, most of them at arming; encoder noise is no fault
@@ -340,7 +340,7 @@ CASES = (
         for n, cause in ((1, f"late axis: {axis} 1.0$"), (2, f"late axis: {axis}"))
     ),
     *(
-        Fault(f"motor 2 makes {part} of force 1, too", G.STOPPED, "connected axes: 1 2", (f"cross={part}",), _AT_ONCE)
+        Fault(f"motor 2 adds {part} of motor 1's force", G.STOPPED, "connected axes: 1 2", (f"cross={part}",), _AT_ONCE)
         for part in (1.0, 0.5, -1.0)
     ),
     Fault("axes moved by hand", A, free=True, shown=True),
@@ -686,7 +686,7 @@ def table() -> int:
     Returns the number of faults that violate a requirement; a free handle above 1 m/s is a violation, too.
     """
     outcomes = rehearse_faults()
-    print(f"{'fault':58s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'zero ms':>8s}  verdict")
+    print(f"{'fault':58s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'ms to 0':>8s}  verdict")
     for one in outcomes:
         zero = "-" if one.zero_force_ms is None else f"{one.zero_force_ms:.1f}"
         print(

@@ -162,7 +162,7 @@ class _Slow:
     network: int
     decided: int  # number of traces whose rate is larger than its error
     contradicted: int  # number of these traces that contradict the eigenvalues
-    worst: float  # |rate - eigenvalue's| over the error that the trace states
+    worst: float  # |rate - exact growth| over the error that the trace states
     holds: bool
 
 

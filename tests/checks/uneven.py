@@ -55,7 +55,7 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_Un
     """Yield the results of random loops under periods up to T_max, latencies, and both."""
     for index in range(loops):
         rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
-        kind = ("periods", "latency", "both")[index % 3]
+        kind = ("periods", "latency", "periods and latency")[index % 3]
         loop, coupling = _draw(rng, kind)
         required = np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         m = loop.channels
@@ -100,9 +100,9 @@ def _run(
     ticks: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
-    """Return for each set of `hands` the largest and the last energy, both over the first, and the least balance.
+    """Return for each set of `hands` the largest and the last energy over the initial energy, and the least balance.
 
-    `hands` are masses, devices included, and stiffnesses, both (hands, m).
+    `hands` are masses, devices included, and stiffnesses, (hands, m) each.
     """
     mass, stiff = hands
     n, m = mass.shape
@@ -136,7 +136,7 @@ def _run(
         middle = np.einsum("nij,nj->ni", seen[which, everyone], np.hstack([xi[:, : 3 * m], force]))
         a, b = middle - x, after[:, :m] - middle
         work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
-        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # converts energies to multiples of the first
+        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # makes multiples of the initial energy
         balance, size = balance + unit * (work + spent), size + unit * (np.abs(work) + spent)
         least = np.minimum(least, balance / np.maximum(size, 1e-300))
         xi = after

@@ -76,16 +76,16 @@ def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str
     err, files = (place / "err").read_text(errors="surrogateescape"), place / "files"
     present = contents(files)
     expected = good | (json.loads((place / "changed").read_text()) if (place / "changed").exists() else {})
-    closed, wrong = "stderr closed" in case.name or "stdall" in case.name, []
+    closed, wrong = "stderr closed" in case.name or "all streams closed" in case.name, []
     if code not in case.codes:
         wrong.append(f"code {code}, expected {case.codes}: {err[-300:]!r}")
     if any(word in err for word in ("Traceback", "Warning", "Exception ignored")):
-        wrong.append(f"no answer: {err[-400:]!r}")
+        wrong.append(f"traceback or warning: {err[-400:]!r}")
     one_line = err.count("\n") == 1 and not STEERS.search(err[:-1]) and len(err) <= 1200
-    if code in (2, 3) and not (closed or one_line or "--json -: full" in case.name):
-        wrong.append(f"not one line: {err[:300]!r}")
+    if code in (2, 3) and not (closed or one_line or "--json -: stdout full" in case.name):
+        wrong.append(f"not one plain line on standard error: {err[:300]!r}")
     if code == BUT and code in case.codes and not (closed or re.search(case.says, err)):
-        wrong.append(f"does not say {case.says!r}: {err[:300]!r}")
+        wrong.append(f"standard error lacks {case.says!r}: {err[:300]!r}")
     wrong += [f"{name} was changed" for name, digest in expected.items() if present.get(name) != digest]
     return wrong + left(files)
 
@@ -103,7 +103,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 def left(folder: Path) -> list[str]:
     """Return a line for each half-written file."""
-    return [f"{path.name} is left" for path in folder.rglob(".*.*")]
+    return [f"half-written file {path.name} is left" for path in folder.rglob(".*.*")]
 
 
 def run(case: Case, place: Path) -> int:

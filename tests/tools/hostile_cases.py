@@ -35,7 +35,7 @@ def pairs(left: Iterable, right: Iterable, every: int = 2) -> Iterator[tuple]:
 
 @dataclass(frozen=True)
 class Case:
-    """A command line, what is done before it, and how it should end."""
+    """A command line, what is done before the command, and how the command should end."""
 
     name: str
     words: tuple[str, ...]
@@ -70,7 +70,7 @@ def quick(command: str, *more: str) -> tuple[str, ...]:
 
 
 def entries(table: str) -> list[str]:
-    """Return the entries of a text, which are separated by bars between blanks, or by line ends."""
+    """Return the entries of a text, which are separated by ` | ` or by line ends."""
     return re.split(r" \| |\n *", table)
 
 
@@ -131,7 +131,7 @@ def written(name: str, content: str | bytes) -> Callable[[], int]:
 
 
 RIGID = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))
-STREAMS = {"in": (0,), "out": (1,), "err": (2,), "all": (0, 1, 2)}
+STREAMS = {"stdin": (0,), "stdout": (1,), "stderr": (2,), "all streams": (0, 1, 2)}
 LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the quickest commands
 
 
@@ -157,11 +157,11 @@ def streams() -> Iterator[Case]:
         resource.setrlimit(resource.RLIMIT_AS, (now + 100_000_000,) * 2)
 
     kinds = [
-        *((f": std{name} closed", (), (0, 1), "", closed(*numbers)) for name, numbers in STREAMS.items()),
+        *((f": {name} closed", (), (0, 1), "", closed(*numbers)) for name, numbers in STREAMS.items()),
         (" --json -: stdout closed", ("--json", "-"), (0, 1), "", closed(1)),
-        (": ASCII", (), (0, 1), "", ascii_only),
-        (": full", (), (BUT,), "No space left", full),
-        (" --json -: full", ("--json", "-"), (BUT,), "No space left", full),
+        (": ASCII stdout", (), (0, 1), "", ascii_only),
+        (": stdout full", (), (BUT,), "No space left", full),
+        (" --json -: stdout full", ("--json", "-"), (BUT,), "No space left", full),
     ]
     for words, (name, more, codes, says, before) in pairs(LEAST, kinds):
         yield Case(words[0] + name, (*words, *more), codes, says, before)

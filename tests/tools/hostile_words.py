@@ -38,13 +38,14 @@ def numeric_options() -> Iterator[Case]:
 INPUTS = """run --scenario | run --human | run --pattern | audit --scenario | check | export | trace | replay
     view --coupling"""
 NO_FILES = {
-    "missing": "nix", "folder": "dir", "pipe": "fifo", "endless": "/dev/zero", "terminal": "/dev/tty", "circle": "loop",
-    "long": "n" * 300, "very long": "n/" * 3000, "control": "n\x1b]0;x\x07\r\n", "right to left": "n\u202eabc",
+    "missing": "nix", "folder": "dir", "pipe": "fifo", "endless": "/dev/zero", "terminal": "/dev/tty",
+    "link to itself": "loop", "long": "n" * 300, "very long": "n/" * 3000,
+    "control characters": "n\x1b]0;x\x07\r\n", "right to left": "n\u202eabc",
     "no UTF-8": "n\udcff", "below a file": "s.toml/x", "empty": "",
 }  # fmt: skip
 OUTPUTS = """run --out | run --json | design --out | export --out | trace --plot | audit --json | view --video
     bridge --out"""
-NO_OUTPUTS = ("below a file", "very long", "long", "circle", "folder", "no folder", "kernel", "zero")
+NO_OUTPUTS = ("below a file", "very long", "long", "link to itself", "folder", "no folder", "in /proc", "zero byte")
 
 
 def odd_paths() -> Iterator[Case]:
@@ -58,12 +59,12 @@ def odd_paths() -> Iterator[Case]:
         if option == "--coupling":
             path, says = path if path.startswith(("/", "dir", "fifo", "loop", "s.toml")) else f"{path}.json", ""
         yield Case(f"{place} {kind}", quick(command, f"{option}={path}"), says=says)
-    files = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
+    files = {"no folder": "nix/r", "in /proc": "/proc/self/r", "zero byte": "r\0"} | NO_FILES
     for place, kind in pairs(entries(OUTPUTS), NO_OUTPUTS):
         command, option = place.split()
         if place in ("run --out", "bridge --out") and kind in ("folder", "no folder"):
             continue  # The command uses or makes the folder.
-        suffix = ".gif" if option == "--video" and kind not in ("folder", "circle") else ""
+        suffix = ".gif" if option == "--video" and kind not in ("folder", "link to itself") else ""
         words = (command, *(() if command == "view" else QUICK[command]), option, files[kind] + suffix)
         yield Case(f"{place} {kind}", words, says=option)
 
@@ -94,11 +95,11 @@ def overwritten() -> Iterator[Case]:
     for words in map(split, entries(BOTH)):
         yield Case(" ".join(words), words, says="also|read")
     words = split("run --case none --scenario dir/report.json --out dir")
-    yield Case("a report over its scenario", words, says="read", before=written("dir/report.json", TEXT))
+    yield Case("a report that would replace its scenario", words, says="read", before=written("dir/report.json", TEXT))
     words = split("run --case none --out new --json new/trace.npz")
-    yield Case("json over the trace", words, says="twice", before=lambda: os.mkdir("new"))
+    yield Case("a report that would replace the trace", words, says="twice", before=lambda: os.mkdir("new"))
     hard = ("design", "--scenario", "s.toml", "--json", "hard")
-    yield Case("a second name of the scenario", hard, says="also", before=lambda: os.link("s.toml", "hard"))
+    yield Case("a hard link of the scenario", hard, says="also", before=lambda: os.link("s.toml", "hard"))
 
 
 #: command lines, each with the words of its error line if these are not its last option
@@ -127,7 +128,7 @@ SILENT = """run --case none --coupling zzz | validate --case none --coupling zzz
     validate --generations 5 | view --video v.xyz | view --video '' | view --video v.gif --script x
     view --video v.gif --script -1:quit"""
 #: a scenario whose handles and hands weigh 1 mg
-FEATHER = TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace("[{ mass = 0.3", "[{ mass = 1e-6")
+LIGHT = TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace("[{ mass = 0.3", "[{ mass = 1e-6")
 
 
 def silence() -> Iterator[Case]:
@@ -137,8 +138,8 @@ def silence() -> Iterator[Case]:
         yield Case(" ".join(words), words, says=says or [word for word in words if word.startswith("--")][-1])
     if not SHORT:
         accuracy = ("accuracy", "--scenario", "s.toml")
-        yield Case("accuracy of a feather", accuracy, before=written("s.toml", FEATHER))
-        yield Case("run of a feather", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", FEATHER))
+        yield Case("accuracy with masses of 1 mg", accuracy, before=written("s.toml", LIGHT))
+        yield Case("run with masses of 1 mg", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", LIGHT))
 
 
 #: command -> options that are refused
@@ -191,7 +192,7 @@ _DRAWS = HUMANS + "class P:\n    def draw(self, rng, n): {}\npopulation = P()\n"
 #: name -> text of a Python file of hands, most of which fail or do harm
 PEOPLE = {
     "ends": "raise SystemExit(0)", "interrupts": "raise KeyboardInterrupt", "no syntax": "humans = [",
-    "a number": "humans = 5", "strings": "humans = ['a', 'b']", "one": HUMANS.replace("* 2", ""),
+    "a number": "humans = 5", "strings": "humans = ['a', 'b']", "one hand": HUMANS.replace("* 2", ""),
     "a port that is none": _PORT.format("return None", "return 0 * t"),
     "a port that raises": _PORT.format("raise RuntimeError('\\x1b[2J' * 500)", "return 0 * t"),
     "a force that raises": _PORT.format(_GOOD, "raise OSError(28, 'no')"),
@@ -208,12 +209,13 @@ PEOPLE = {
 
 def combined() -> Iterator[Case]:
     """Yield impossible options, options that exclude each other, and harmful Python files of hands."""
-    asked = [(command, line, (BUT,), HUMANS) for command, lines in REFUSED.items() for line in entries(lines)]
+    for command, lines in REFUSED.items():
+        for line in entries(lines):
+            words = (command, *(QUICK[command] if command != "audit" else ()), *shlex.split(line))
+            yield Case(f"{command} {line}", words, before=written("h.py", HUMANS))
     for (name, text), command in pairs(PEOPLE.items(), ("run", "validate")):
-        asked.append((command, f"--case none --human h.py:humans --seed {len(name)}", (0, 1, 2, 130), text))
-    for command, line, codes, people in asked:
-        words = (command, *(QUICK[command] if command != "audit" else ()), *shlex.split(line))
-        yield Case(f"{command} {line}", words, codes, before=written("h.py", people))
+        words = quick(command, "--case", "none", "--human", "h.py:humans")
+        yield Case(f"{command} with hands in Python: {name}", words, (0, 1, BUT, 130), before=written("h.py", text))
 
 
 #: names that a typesetter, a terminal or a format string would interpret

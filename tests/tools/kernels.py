@@ -85,7 +85,7 @@ NEEDS = {
     "ZEN": "AVX2",
     "SKYLAKEX": "AVX512_SKX",
 }
-#: asks NumPy for its features, and threadpoolctl for the kernels that NumPy's and SciPy's OpenBLAS use
+#: program that asks NumPy for its features, and threadpoolctl for the kernels that NumPy's and SciPy's OpenBLAS use
 _ASK = """
 import json, numpy, scipy.linalg
 from threadpoolctl import threadpool_info

@@ -58,7 +58,7 @@ class _Runner:
 
     def __init__(self, module: str, drawn: Sequence[Mutant], jobs: int) -> None:
         self.module, self.drawn, self.jobs = module, drawn, jobs
-        self.ends: list[tuple[Mutant, str]] = []  # killed, timeout, survived or broken
+        self.ends: list[tuple[Mutant, str]] = []  # "killed", "timeout" or "survived"
         self.trouble, self.calling = "its tests did not run", False
 
     @pytest.hookimpl(tryfirst=True)

@@ -8,7 +8,7 @@ the pages (`same_line`). The exit code is 1 if they differ or if a command fails
     $ python -m design.audit ..
     ```
 
-    <!-- measured: RK4 x 4 -->            lines of a command that is slow or prints times, by such an expression
+    <!-- measured: RK4 x 4 -->            matching lines of a command that is slow or prints times
     ```text
     $ python -m sim.accuracy
 
