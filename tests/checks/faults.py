@@ -683,7 +683,8 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None, force: floa
 def table() -> int:
     """Print each fault's peak force, peak speeds of held and free handles, time to zero and verdict.
 
-    Returns the number of faults that violate a requirement; a free handle above 1 m/s is a violation, too.
+    In names, "free" means that nobody holds the handles, and "then the end" that a person stops the session, which then
+    tests all axes. Returns the number of faults that violate a requirement; a free handle above 1 m/s is one, too.
     """
     outcomes = rehearse_faults()
     print(f"{'fault':58s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'ms to 0':>8s}  verdict")
