@@ -304,7 +304,7 @@ class _Report:
     @property
     def finished(self) -> str:
         """The number of finished humans, for a validation that ended early."""
-        return f"{self.humans} humans were finished before"
+        return f"{self.humans} humans were finished by then"
 
     @property
     def certified_words(self) -> str:

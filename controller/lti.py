@@ -512,7 +512,7 @@ def _schur_form(A: Array) -> tuple[Complex, Complex]:
 
 
 def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) -> Complex:
-    """Return sum residues/(z - poles) + sum_j weights_j z^-j-1 at points z, (entries, points)."""
+    """Return sum residues/(z - poles) + sum_j weights_j z^-(j+1) at points z, (entries, points)."""
     total = residues @ (1 / (points - poles[:, None]))
     if weights.size:
         late = _powers(1 / points, weights.shape[1])

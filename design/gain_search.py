@@ -253,7 +253,7 @@ class SampledLoop:
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
-        """Return the least distance of the loop's poles from the unit circle, less _CLOSEST_POLE."""
+        """Return the least distance of the loop's poles from the unit circle, minus _CLOSEST_POLE."""
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 

@@ -417,7 +417,7 @@ class _Search:
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
         """Return z (k,), and the block without L as an affine function of beta and the multipliers, (.., k, n, n).
 
-        The first entry is the block at zero beta and zero multipliers, less the margin `spare` of the demand. The
+        The first entry is the block at zero beta and zero multipliers, minus the margin `spare` of the demand. The
         others are the slopes in each unknown.
         """
         m, z = self.m, on_circle(w)

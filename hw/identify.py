@@ -209,7 +209,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
     """Return the transmission that explains the spectrum of a record, or None.
 
-    The encoder is at the motor, where dry friction acts. So the force less dry friction drives a linear plant.
+    The encoder is at the motor, where dry friction acts. So the force minus dry friction drives a linear plant.
     """
     spectrum = Spectra(x, force - dry_friction(x, T, found), T, band=_BAND_HZ, points=len(x))
     limits = _LEAST, np.full(7, np.inf)

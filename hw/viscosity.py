@@ -9,7 +9,7 @@ motor is W = b S2 + g S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n =
 constant force, k a spring's stiffness and l the lag of an amplifier. For viscous and dry friction q = 0 at every
 amplitude. Where friction thins, q < 0, and the damping at the speed v is b + q v.
 
-Frequency: a model is fitted to the motion under the motor's force, less dry friction, drag, spring and drift. It has a
+Frequency: a model is fitted to the motion under the motor's force minus dry friction, drag, spring and drift. It has a
 transmission, an amplifier's lag and, for each of several tau, a Maxwell element (c, tau) beside b. The element's
 damping c/(1 + (w tau)^2) acts in the record's slow strokes and vanishes at high frequency, where only b is left. A
 certificate uses the damping at every frequency, so only b counts. The bound is the least lower confidence limit of b
@@ -188,7 +188,7 @@ class Spectra:
         return np.vstack([sums, response.sum(axis=0)]).T[:, : len(p)]
 
     def error(self, p: Array, tau: float = 1.0) -> Array:
-        """Return the real and imaginary parts of motion less model, over the largest motion."""
+        """Return the real and imaginary parts of motion minus model, over the largest motion."""
         return self._real(self.motion - self.model(p, tau))
 
     def jacobian(self, p: Array, tau: float = 1.0) -> Array:

@@ -44,7 +44,7 @@ _APART = 1e-12  # entries of D_V, the direct part of a coupling, below this rela
 class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
-    given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
+    given_J: float  # largest energy that hands and devices received, minus what the devices' damping dissipated
     port_least_J: float  # least energy that had entered the scene by any tick: sum of f'(u[k] - u[k-1]), contacts at u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # bound on the energy that constraints created (the lemma on MuJoCo worlds in docs/theory.md)

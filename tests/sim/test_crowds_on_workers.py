@@ -66,7 +66,7 @@ def test_reports_count_humans_finished_before_memory_ran_out(tmp_path, monkeypat
 
     monkeypatch.setattr(crowds, "_examine", fails)
     assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
-    assert f"memory ran out; {_BATCH} humans were finished before" in " ".join(
+    assert f"memory ran out; {_BATCH} humans were finished by then" in " ".join(
         capsys.readouterr().out.replace("│", " ").split()
     )
     report = json.loads((tmp_path / "report.json").read_text())
