@@ -203,7 +203,7 @@ CASES = (
         "drift by {} m/s, below the speed limit, encoder {}", "drift", 0.69, "speed: {axis} 0.7|range: {axis} ", None
     ),
     *_signed("drift by {} m/s, encoder {}", "drift", 1.5, "speed: {axis} ", _STOP + 12 * _T_MS),
-    *_signed("{} mm, out of the range of encoder {}", "jump", 200, r"range: {axis} {sign}\d", None, ""),
+    *_signed("offset of {} mm, out of the range of encoder {}", "jump", 200, r"range: {axis} {sign}\d", None, ""),
     Fault("encoder dead before arming", G.STOPPED, "dead encoder: 1 0 ", ("freeze",), _AT_ONCE),
     Fault("encoder 2 dead before arming", G.STOPPED, "dead encoder: 2 0 ", ("axis2:freeze",), _STOP),
     Fault("one channel of encoder 1 dead before arming", G.STOPPED, "(dead|still) encoder: 1 ", ("toggle",), _AT_ONCE),
@@ -277,7 +277,7 @@ CASES = (
     ),
     *(
         Fault(
-            f"motor {axis} makes {share} of negative forces before arming{', free' * free}",
+            f"motor {axis} makes {share} times negative forces before arming{', free' * free}",
             G.STOPPED,
             f"one-sided (motor|encoder): {axis}",
             (f"axis{axis}:oneway={share}",),
