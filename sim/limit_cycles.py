@@ -172,7 +172,7 @@ class Points:
     """The simulated cells, (k,) each."""
 
     cell: Cells  # flat index in the grid
-    oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace, or the trace diverged
+    oscillates: NDArray[np.bool_]  # whether the trace oscillates to its end, or diverged
     amplitude: Array  # [m] amplitude of the oscillation; inf if the trace diverged
     frequency_hz: Array  # [Hz] frequency of the oscillation; nan if the trace diverged
     growth: Array  # [1/s] exact growth of the dominant mode that a trace can show, with all walls touched

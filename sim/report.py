@@ -229,7 +229,7 @@ class UnevenTicks:
     """The periods of a run, and the latencies of its forces."""
 
     period_s: _Periods
-    recorded: bool  # whether the periods come from a file; otherwise they are drawn at random or constant
+    recorded: bool  # whether the periods repeat a recorded list; otherwise they are random or constant
     T_max_s: float | None  # the longest period that certificates must cover; None if every period is T
     latency_s: tuple[tuple[float, float], ...] | None  # (least, most) of each channel; None: forces latch at ticks
 
