@@ -407,7 +407,7 @@ class EncoderTest:
         if weak and (small or lopsided or (unclear and not self._closing)):
             return None  # dry friction hides much of a weak motion; a stronger force overcomes it
         if not 1 / _TEST_RATIO <= size <= _TEST_RATIO:
-            brake = ", or dry friction brakes it" if small else ""
+            brake = f", or dry friction brakes it{self._axes.limits.raise_cap(axis, '')}" * small
             than = f"{size:.2g} times as far as expected of {mass:.3g} kg"
             return f"{name} moves {than}: its encoder step, force step or mass is wrong{brake}"
         if size < least:
@@ -446,8 +446,12 @@ class EncoderTest:
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._answer.span[self._axis]) > self._axes.still[self._axis]:
-            return f"axis {axis} does not follow {at} as a free handle: let go of it while arming{self._or_undeclared}"
-        return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"
+            slips = self._axes.limits.raise_cap(self._axis, ". If nobody holds it, dry friction may brake it")
+            holds = f"let go of it while arming{self._or_undeclared}{slips}"
+            return f"axis {axis} does not follow {at} as a free handle: {holds}"
+        sticks = self._axes.limits.raise_cap(self._axis, " If so, dry friction may hold it")
+        motor = f"Is its motor on?{sticks}"
+        return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. {motor}"
 
 
 class EncoderMonitor:

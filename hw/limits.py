@@ -80,6 +80,7 @@ class SafetyLimits:
     thermal: float = 10.0  # [s] time constant of the motors
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector whose length is limited
     lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the limits; else 1
+    raisable: tuple[bool, ...] = ()  # (m,) axes with a default cap below 1.3 N that --force-cap can raise; empty: none
 
     def __post_init__(self) -> None:
         r = self.lever
@@ -92,8 +93,12 @@ class SafetyLimits:
         require("thermal", self.thermal, 0.1, 1000.0, "s")
         if self.continuous and len(self.continuous) != len(self.cap):
             raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
-        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
-            require(f"continuous #{i} (--continuous-force)", most, 1e-3 * r, cap, "N")
+        for i, most in enumerate(self.continuous, start=1):
+            require(f"continuous #{i} (--continuous-force)", most, 1e-3 * r, 12.0 * r, "N")
+
+    def raise_cap(self, axis: int, why: str) -> str:
+        """Return `why` and the advice to raise the cap of `axis` if it is a small default cap, else ""."""
+        return f"{why}: raise --force-cap" if any(self.raisable[axis : axis + 1]) else ""
 
     def shape(
         self,
@@ -204,7 +209,8 @@ class SafetyLimits:
             if 1e-6 * damping < delta * (1 - 1e-6):
                 reasons.append(f"axis {i} guarantees {1e-6 * damping:g} N s/m, the certificate needs delta = {delta:g}")
             if step > finest:
-                reasons.append(f"one force step of axis {i} is {step:g} N, at most {finest:g} N is allowed")
+                more = self.raise_cap(i - 1, " at this small force cap")
+                reasons.append(f"one force step of axis {i} is {step:g} N, at most {finest:g} N is allowed{more}")
             if count > widest:
                 mm = f"{1e3 * count:g} mm, at most {1e3 * widest:g} mm is allowed"
                 reasons.append(f"one encoder count of axis {i} is {mm}")

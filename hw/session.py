@@ -442,6 +442,12 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float | None = 
         axes[first:end] = 1
     own = np.repeat(each, counts) * r / np.sqrt(axes)  # (m,) [N or N m]
     caps = tuple(map(min, own.tolist(), limits))
+    if cap is None:
+        if min(own) < 1e-3 * r:
+            least = f"the damping of a device is {min(each) / FREE_SPEED:g} N s/m at the hand"
+            raise InputError(f"{least}, too small for a default force cap of 0.001 N or more: give --force-cap")
+        small = np.repeat(each, counts) < USUAL_CAP
+        scaled["raisable"] = tuple((small & (own < limits)).tolist())
     try:
         safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
         return Session(scenario, safety, settings)

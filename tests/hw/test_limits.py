@@ -106,7 +106,7 @@ def test_an_impossible_gain_is_a_fault(gain):
         ("speed", 1e-3, 2.5),
         ("thermal", 0.1, 1000.0),
         ("cap", (1e-3,), (12.0,)),
-        ("continuous", (1e-3,), (6.0,)),
+        ("continuous", (1e-3,), (12.0,)),
     ],
 )
 def test_limits_stay_within_their_ranges(field, least, most):

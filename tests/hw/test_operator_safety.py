@@ -16,16 +16,16 @@ import pytest
 from causes import cause_of
 from messages import says
 from msgspec.structs import replace
-from sessions import rehearsal_of
+from sessions import RubbingEmulator, rehearsal_of
 from shared import FakePort
 
 from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser
 from haptic_loop.cli.session_cli import limits_from, touched
 from haptic_loop.hw import transport
-from haptic_loop.hw.control import TraceRow
+from haptic_loop.hw.control import CouplingRequest, TraceRow, certified_couplings
 from haptic_loop.hw.driver import Driver, Operator
-from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -153,6 +153,52 @@ def test_sessions_have_low_default_limits(scenario):
     args = _parser().parse_args(["--rehearse", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
+    args = _parser().parse_args(["--rehearse", "--continuous-force", "5"])  # the motors' rating is above the cap
+    limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
+    assert (limits.cap, limits.continuous) == ((1.3, 1.3), (5.0, 5.0))
+
+
+def light_device(damping):
+    """Return a rigid device of 0.1 kg and `damping` [N s/m] that nobody holds."""
+    return parse(
+        f"""
+name = "light"
+T = 1e-3
+theta = [1]
+device = [{{ kind = "rigid", mass = 0.1, damping = {damping} }}]
+[environment]
+contacts = ["handle"]
+springs = [{{ between = ["handle", "ground"], stiffness = 9.0, damping = 1e-6 }}]
+"""
+    )
+
+
+@pytest.mark.parametrize("friction", [0.22, 0.8])
+@pytest.mark.parametrize("cap", [None, 0.3])
+def test_small_default_caps_name_dry_friction(cap, friction):
+    """Friction brakes or holds a handle at the default cap of 0.3 N; a cap that the user chose needs no advice."""
+    scenario = light_device(0.3)
+    session = session_for(scenario, LinkSettings(measure=60, held=False), cap)
+    emulator = RubbingEmulator(nobody(scenario), coulomb=friction)
+    couplings = certified_couplings(CouplingRequest(scenario), 1, spare=0)
+    Rehearsal(session, emulator, lambda ages: couplings).run_until_armed(1.0)
+    assert (session.stage, session.limits.cap) == (Stage.STOPPED, (0.3,))
+    assert all((words in session.cause) == (cap is None) for words in ("dry friction", "raise --force-cap"))
+
+
+def test_coarse_force_steps_name_a_small_default_cap():
+    scenario = light_device(0.3)
+    coarse = info_of(scenario)._replace(force_step=(23_500,), hard_limit=(127,))
+    (reason,) = session_for(scenario, LinkSettings(), None).limits.objections(coarse, scenario, None)
+    assert reason.endswith("at most 0.01875 N is allowed at this small force cap: raise --force-cap")
+    (reason,) = session_for(scenario, LinkSettings(), 0.3).limits.objections(coarse, scenario, None)
+    assert reason.endswith("at most 0.01875 N is allowed")
+
+
+def test_damping_too_small_for_a_cap_is_named():
+    with pytest.raises(InputError, match=r"damping of a device is 0\.0008 N s/m .*: give --force-cap"):
+        session_for(light_device(8e-4), LinkSettings(), None)
+    assert session_for(light_device(8e-4), LinkSettings(), 0.05).limits.cap == (0.05,)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +306,7 @@ def test_a_second_of_cut_forces_stops_sessions(scenario, link_couplings, by_cap,
         (["--force-cap", "13"], "--force-cap is 13 .. 0.05 to 12"),
         (["--max-speed", "0"], "--max-speed is 0 .. 0.001 to 2.5"),
         (["--continuous-force", "1,2,3"], "--continuous-force has 3 entries"),
-        (["--continuous-force", "5"], "continuous #1 (--continuous-force) is 5"),
+        (["--continuous-force", "13"], "continuous #1 (--continuous-force) is 13"),
         (["--thermal-time", "nan"], "--thermal-time is nan"),
         (["--port", "/nowhere", "--deadman", "key"], "--deadman key needs a terminal"),
     ],
