@@ -84,8 +84,8 @@ def _parser() -> options.Parser:
     varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
-        "fail unless the proof also covers limited forces; allowed for this-environment, and for known-device with an "
-        "optimal coupling (default: only a spring-damper tries this proof)"
+        "fail unless the proof also covers limited forces; for known-device only with an optimal coupling (default: "
+        "only a spring-damper tries this proof)"
     )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)

@@ -33,6 +33,7 @@ from haptic_loop.sim.scenario import (
     Scenario,
     built_in,
     held_by,
+    is_world,
     load,
     own_environment,
     world_environment,
@@ -455,6 +456,10 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     if (args.reference or args.case == "II") and (args.lam or scenario.lam is not None):
         option = f"--reference {args.reference}" if args.reference else "--case II"
         raise InputError(f"{option} with {'--lam' if args.lam else 'lam of the scenario'}: both set the reference")
+    if is_world(scenario) or getattr(args, "world", None):
+        require_no_reference(args, "in a MuJoCo scene no transparency error is computed")
+    elif getattr(args, "rigid", False):
+        require_no_reference(args, "the rigid wall replaces the reference")
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     each = "channel" if scenario.channels == len(scenario.device) else "device"
     values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
@@ -470,6 +475,17 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
             pairs = zip(scenario.device, bounds, strict=True)
             changes["device"] = tuple(msgspec.structs.replace(one, guaranteed=bound) for one, bound in pairs)
     return scenario.replace(**changes) if changes else scenario
+
+
+def require_no_reference(args: argparse.Namespace, why: str) -> None:
+    """Raise InputError for --reference II, --case II or --lam; `why` says why the option has no effect."""
+    for option, chosen in (
+        ("--lam", args.lam),
+        ("--reference II", args.reference == "II"),
+        ("--case II", args.case == "II"),
+    ):
+        if chosen:
+            raise InputError(f"{option}: {why}; leave it out")
 
 
 def _known_device(text: str) -> DeviceBounds:

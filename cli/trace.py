@@ -35,12 +35,12 @@ def main(argv: list[str]) -> int:
     if args.plot:
         from haptic_loop.sim.plots import draw_run, save
 
-        strongest = next((one.frequency_hz for one in rates if one.frequency_hz), _ZOOM_HZ)
-        save(draw_run(result.signals, args.trace, strongest), Path(args.plot))
+        shown = next((one.frequency_hz for one in rates if one.frequency_hz), _ZOOM_HZ)
+        save(draw_run(result.signals, args.trace, shown), Path(args.plot))
     traced = _Traced(args.trace, result.t.size, float(result.t[-1]), rates)
     T = traced.duration_s / max(1, traced.ticks - 1)
     lines = [f"growth, {one.words(T)}" for one in rates]
-    none = "No part of the trace is linear and at full gain: there is no growth to report."
+    none = "The trace has no part with a linear loop and full gain: there is no growth to report."
     render.publish(args, traced, (), lines, verdict=_verdict(rates) if rates else none)
     return options.DONE
 
@@ -49,9 +49,14 @@ def _verdict(growths: list[Growth]) -> str:
     rates = [one for one in growths if one.trend]
     if not rates:
         return "No growth rate can be given."
-    words = {"grows": "An oscillation grows", "neither": "An oscillation neither grows nor decays"}
-    worst = max(rates, key=lambda one: one.growth_rate_per_s or 0.0)
-    return f"{words.get(worst.trend or '', 'All oscillations decay')}: {worst.growth_rate_per_s:+.4g} 1/s."
+    words = {
+        "decays": "All oscillations decay",
+        "neither": "An oscillation neither grows nor decays",
+        "grows": "An oscillation grows",
+    }
+    order = [*words]
+    worst = max(rates, key=lambda one: (order.index(one.trend or ""), one.growth_rate_per_s or 0.0))
+    return f"{words[worst.trend or '']}: {worst.growth_rate_per_s:+.4g} 1/s."
 
 
 def _parser() -> options.Parser:

@@ -30,7 +30,7 @@ class SingularLoop(ValueError):
 
 
 class TooLong(ValueError):
-    """A computation ended without a result because its budget of work or the user's time is spent."""
+    """A computation was refused for its size, or ended because its budget of work or the user's time is spent."""
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ class Coupling:
         return environment.feedback(as_like(environment, V))
 
     def compliance(self, T: Number) -> Lti | None:
-        """Return V(z) in the arithmetic of T, or None if the coupling is not a V in feedback around Psi E."""
+        """Return V(z) in the arithmetic of T, or None if the class defines no V (`NoCoupling`, force filters)."""
         return Lti.diag(*channels) if (channels := self.channels(T)) else None
 
     def channels(self, T: Number) -> list[Lti] | None:
@@ -457,8 +457,8 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
     Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The chain for
-    the sum of all inputs needs few states of its own: up to the length of the shortest input's chain, its states are
-    sums of the states of the inputs' chains. Only the states beyond this length become new states of the block.
+    the sum of all inputs needs few new states: its first states, as many as the shortest chain of an input has, are
+    sums of states of these chains. Only its further states become new states of the block.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size

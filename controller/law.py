@@ -44,7 +44,8 @@ class Law(ReadOnly):
 
     `sent` is the block from [x; p] to [f_e; y], with the forces f_e before Theta. The walls compute p from y. The state
     consists of the state of the block with its delays, and of h [m], the depth in each wall at the previous tick.
-    Raises SingularLoop if the walls' forces are not unique, and ValueError if `sent` has another size.
+    Raises SingularLoop if the walls' forces are not unique, and ValueError if `sent` does not have m + w
+    inputs and outputs.
     """
 
     sent: Lti  # m + w inputs and outputs, for w walls
@@ -124,7 +125,7 @@ class Law(ReadOnly):
         return self.open.at_rest(x)
 
     def frozen(self) -> dict[State, Lti]:
-        """Return F for every set of touching walls, from none to all, without the constant forces of the gaps."""
+        """Return F for every set of touching walls, from none to all, without the constant offsets that gaps cause."""
         block, m, T, walls = self._delayed(self.sent), self.channels, self.sent.T, range(len(self.walls))
         if not self.walls:
             return {(): block}
@@ -219,9 +220,9 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 #         f_e = G (x - e) - rho (e - e_-),      |f_e,i| <= L_i,      e_i f_e,i = L_i |e_i|.
 #
 # While no force reaches its limit, e = 0. Let f_free be f_e for e = 0 at this tick (earlier slips included), and D_G
-# the feedthrough of G. The limiter solves f_e = f_free - (D_G + rho) e with e in the normal cone of the box at f_e,
-# together with the walls, whose forces p are in the normal cone of the box (-inf, 0] at a (d - c) - p. Slips and wall
-# forces together solve one box problem (controller.complementarity).
+# the feedthrough of G. The limiter solves f_e = f_free - (D_G + rho) e, where e is in the normal cone of the box at
+# f_e. The walls are solved at the same time: their forces p are in the normal cone of (-inf, 0] at a (d - c) - p. Slips
+# and wall forces together solve one box problem (controller.complementarity).
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -233,7 +234,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all channels of a ball
-    rho: Array  # (m,) [N/m] 0 if certified for any environment with psi = 0, else beta times least damping over T
+    rho: Array  # (m,) [N/m] 0 for any-environment with psi = 0, else beta/T times the device's least damping
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Bound the least eigenvalue of He G = (G + G*)/2 from below on the unit circle, and |G| from above near points."""
+"""Bound the least eigenvalue of He G = (G + G*)/2 from below on the unit circle; bound |G| near given frequencies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # number of intervals of [0, pi] at the start
-#: largest number of evaluations for up to 8 states, which take half a second; more states are allowed fewer
+#: largest number of evaluations for up to 8 states, which take half a second; a system with more states gets fewer
 _EVALUATIONS = 1 << 15
 _REACH = 0.5  # a bound is computed for half-widths up to _REACH/|(zI - A)^-1|
 _UNIT = 2.0**-53  # largest relative error of one rounding
@@ -71,7 +71,7 @@ def _balanced(G: Lti) -> Lti:
     return Lti(G.A * size / size[:, None], G.B / size[:, None], G.C * size, G.D, G.T)
 
 
-_IDLE = 1e-13  # smaller singular values, relative to the largest one, belong to directions in which G is zero
+_IDLE = 1e-13  # singular values below this share of the largest one belong to directions in which G is zero
 _Lost = tuple[float, float, float]
 
 

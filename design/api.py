@@ -146,6 +146,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
         SingularLoop: A coupling of your own class makes an algebraic loop without solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
+    if condition is not None:
+        of_kind("condition", condition, Condition, "your own Condition; the result has all conditions that have a name")
     alone, (_, own) = fitting(loop, coupling), name_and_own(condition)
     own = own or (coupling.own if isinstance(coupling, Design) else None)
     requirements = requirements_of(loop, alone, own=own)

@@ -22,18 +22,19 @@ EXACT = 60.0
 SWEEPS = 60.0
 #: The search for larger bases of an optimal coupling. The slowest of the 23 loops (o11) takes 19.
 GROWTH = 60.0
-#: The search between the vertices of ranges, for one coupling: about 500 sweeps for each set of present springs.
+#: The search between the vertices of ranges, for one coupling. It sweeps about 500 times for each choice of optional
+#: springs.
 RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
 #: Largest number of states of a loop with a basis. Design and proof of a loop with 268 states take 8 units (n6).
 BASIS_STATES = 270
-#: Largest cost of the proofs of a basis, (number of environments) states^2.7. It is that of 30 proofs over 112 states.
+#: Largest cost of the proofs of a basis, environments * states^2.7. It equals 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
 #: Largest number of unknowns of a basis with filters between all channels, for this-environment alone (ten seconds).
 BASIS_UNKNOWNS = 1600
-#: In all other cases, the largest product of the numbers of unknowns and channels (also ten seconds).
+#: Largest (unknowns x channels) of any other basis: with fewer filters, or more conditions (also ten seconds).
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried. Loops with ranges have
 #: no such limit.
@@ -51,30 +52,30 @@ PROOF_STATES = 800
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have 24 rows.
 MULTIPLIER_ROWS = 24
-#: Rounds of a search for gains, each with more frequencies (3 for case I), and numbers of steps in a round. With many
-#: channels a round takes the first number of steps from every start, and the second from the best starts. With few
-#: channels it takes the third number from every start.
+#: Rounds of a search for gains, each with more frequencies (3 for case I). Then the numbers of steps: to rank the
+#: starts once (only above 12 channels), in a round above 12 channels, and in a round up to 12 channels.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 #: Rounds that add frequencies to a design by Theorem 4. Only delays of at least a hundred samples need such rounds.
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains (2 for case I).
 SEQUENCE_STEPS = 60
-#: Designs for less and less damping, until the coupling satisfies a second condition (2 for one-wall.toml).
+#: Designs for different shares of the damping, until the coupling satisfies a second condition (2 for one-wall.toml).
 LESS_DAMPING_ROUNDS = 6
 #: Rounds that add frequencies to the program of an optimal coupling (4 for case I).
 PROGRAM_SWEEPS = 6
-#: Rounds that add frequencies to the bound on linear couplings, number of its vanishing sums of coefficients s_k
-#: (docs/theory.md), and intervals of its integral (2 rounds and 568 intervals for cases I and II).
+#: For the bound on linear couplings: rounds that add frequencies, largest number of sums of its coefficients s_k that
+#: are zero because of delays (docs/theory.md), and intervals of its integral (2 rounds, 568 intervals: cases I, II).
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Convex problems for a coupling of fixed order (44 for case I).
 FIXED_ORDER_PROBLEMS = 100
-#: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
+#: For known-device: rounds of cuts for the least share of the damping with fixed beta, and rounds of tangents for beta
 #: and multipliers (4 cuts and 11 rounds for the pair of omega.3 with known transmissions).
 BETA_CUTS, BETA_ROUNDS = 40, 60
 #: Numbers of points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, and at least
-#: RANGE_ALONG[0] and at most RANGE_ALONG[1] on each edge. From six parameters on, the least number for each edge gives
-#: more than RANGE_EDGES in total. RANGE_DRAWN points lie on faces and inside. RANGE_STARTS compass searches follow. For
-#: up to five parameters this takes the 500 sweeps of RANGES.
+#: RANGE_ALONG[0] and at most RANGE_ALONG[1] on each edge. With six or seven parameters, the least number for each edge
+#: gives more than RANGE_EDGES in total. With more, RANGE_EDGES points on random edges are tried. RANGE_DRAWN points lie
+#: on faces and inside, with more than seven parameters only inside. RANGE_STARTS compass searches follow. For up to
+#: five parameters this takes the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge. Brackets hold the largest number that was measured in the optimal and the default

@@ -94,7 +94,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
-    """Return the condition's name, and the condition itself if it is the user's own. Each is None otherwise."""
+    """Return the condition's name, and the condition itself if it is the user's own, else None."""
     if condition is None or isinstance(condition, str):
         return condition, None
     ours = (*_OWN.conditions, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -113,8 +113,8 @@ def design_by_kind(
     Args:
         kind: A name of KINDS, or FILE.py:NAME of a user's own function.
         condition: The condition, or None for `usual_condition`. For a user's own condition the coupling is designed by
-            the kind's usual condition, for a share of the damping with which the coupling satisfies the user's
-            condition.
+            the kind's usual condition for a share of the damping, such that it satisfies the user's condition with
+            the full damping.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
             forces if LIMITER has designs for the loop and a search finds one. Otherwise a design with `limiter` True
@@ -242,7 +242,7 @@ def _in_principal_axes(
     exists for the loop or the kind, and DesignFailed if the coupling is not certified.
     """
     if loop.ranges and kind == "optimal":
-        why = "an optimal coupling is designed in the principal axes of the damping, into which ranges are not turned"
+        why = "an optimal coupling is designed in the principal axes of the damping, where ranges are not supported"
         raise ValueError(f"levels: {why}; use a spring-damper or a moving-average")
     if loop.environment.walls and kind == "spring-damper":
         if options.get("limiter") and (reason := LIMITER.not_designed(loop)):
@@ -308,7 +308,7 @@ _UNUSED = (
 def _with_less_damping(
     loop: Loop, make: Callable[[Loop], Design], condition: Condition, made_for: Condition | None = None
 ) -> Design:
-    """Return a design for a share of the damping, with a coupling that satisfies `condition` for all of the damping.
+    """Return a design for a share of the damping, with a coupling that satisfies `condition` with the full damping.
 
     `make` designs each coupling for the condition `made_for` (by default `condition`), in the nominal environment, with
     all walls in contact and without the latency. If `make` cannot consider switching delays, the loop has its longest

@@ -320,7 +320,7 @@ class ThisEnvironment(Multiplied):
 
     @property
     def extensible(self) -> bool:
-        """Whether this is no subclass: `LimitedForces` and fast sweeps would leave out the facts of a subclass."""
+        """Whether this is ThisEnvironment itself; `LimitedForces` and fast sweeps leave out the facts of a subclass."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
@@ -357,7 +357,7 @@ class ThisEnvironment(Multiplied):
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block. Without a multiplier all walls of this-environment touch, and its delays are constant."""
+        """Return the block. Without a multiplier, it has all walls in contact and constant delays."""
         if multiplier is not None or not self.extensible:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
@@ -576,11 +576,11 @@ def least_phi(loop: Loop) -> Array | None:
 def least_multiplier(loop: Loop) -> Array:
     """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Below
-    this level, its sum of Phi_i/delta_i is the least.
+    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Among
+    all such Phi, it has the least sum of Phi_i/delta_i.
 
     Raises:
-        Infeasible: No such Phi exists, diagonal or not; the message states the damping that would be needed.
+        Infeasible: No such Phi exists. If no full matrix Phi exists either, the message states the damping needed.
         DesignFailed: No diagonal Phi was found.
     """
     delta = even_damping(loop)
@@ -648,7 +648,7 @@ class _AnyEnvironment(Multiplied):
         return type(self) is not _AnyEnvironment
 
     def _in_frame(self, loop: Loop) -> bool:
-        """Return whether `compose_any` builds the block. It does so for a latency, switching delays and own facts."""
+        """Return whether `compose_any` builds the block. It does so for a latency, switching delays, a user's class."""
         return bool(self._extended or loop.latency or loop.varying_delay)
 
     def separable(self, loop: Loop) -> bool:
@@ -690,7 +690,8 @@ class _AnyEnvironment(Multiplied):
         return None if any(loop.psi) else super().beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
-        return "with psi >= 1 each K, T and delay needs another multiplier: not searched" if any(loop.psi) else None
+        many = "with psi >= 1 each K, T and delay needs its own multiplier, which is not searched here"
+        return many if any(loop.psi) else None
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)

@@ -9,8 +9,8 @@ motor is W = b S2 + g S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n =
 constant force, k a spring's stiffness and l the lag of an amplifier. For viscous and dry friction q = 0 at every
 amplitude. Where friction thins, q < 0, and the damping at the speed v is b + q v.
 
-Frequency: a model is fitted to the motion under the motor's force minus dry friction, drag, spring and drift. It has a
-transmission, an amplifier's lag and, for each of several tau, a Maxwell element (c, tau) beside b. The element's
+Frequency: a model is fitted to the motion under the motor's force minus dry friction, drag, spring and drift. It has b,
+a transmission, an amplifier's lag and one Maxwell element (c, tau). Several tau are tried in turn. The element's
 damping c/(1 + (w tau)^2) acts in the record's slow strokes and vanishes at high frequency, where only b is left. A
 certificate uses the damping at every frequency, so only b counts. The bound is the least lower confidence limit of b
 over all tau. A memory that the record cannot exclude, for example because of a coarse encoder, therefore lowers the
@@ -31,15 +31,15 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
-_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed, which saturates dry friction
+_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed; dry friction then saturates
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
-#: [s] time constants of a memory; one of 1 ms counts as damping, as encoders of 5 um at 0.25 kg do not show it
+#: [s] time constants of a memory; a memory of 1 ms counts as damping; a 5 um encoder does not show it at 0.25 kg
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, 1 N causes less motion than an encoder of 5 um resolves
 _LOUD = 0.05  # least force at a frequency, as a share of the largest force at a frequency of the band
 _POINTS = 200  # frequencies of a first, rough fit
-_ALIASES = (-1, 0, 1)  # sampling adds frequencies at multiples of 1/T; further multiples add below 1e-3 of the response
+_ALIASES = (-1, 0, 1)  # sampling adds the responses at w + 2 pi n/T for these n; those of other n are below 1e-3
 _MODES_HZ = np.geomspace(20.0, 300.0, 40)  # initial frequencies of a transmission's mode
 _PARTS = (0.15, 0.3, 0.5, 0.65)  # initial shares of the motor in the mass
 _STEPS = 30  # largest number of evaluations in a fit
@@ -59,7 +59,7 @@ class Viscosity:
     thinning_error: float  # [N s/m] standard error of `thinning`
     lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left at high frequency
     memory: float  # [s] time constant of the memory that this bound assumes
-    remembers: bool  # whether the record shows a memory, not only fails to exclude one
+    remembers: bool  # whether the record shows a memory; False if it merely cannot exclude one
 
 
 def viscosity(x: Array, force: Array, T: float, step: float, friction: Friction) -> Viscosity:
@@ -81,8 +81,8 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
         )
     if found.remembers and found.lasting < friction.delta:
         return (
-            f"the damping falls with frequency, from {friction.viscous:.3g} N s/m to {found.lasting:.3g} beyond "
-            f"{1 / (2 * np.pi * found.memory):.2g} Hz: friction with a memory has no viscous bound"
+            f"the damping falls with frequency, from {friction.viscous:.3g} N s/m to perhaps {found.lasting:.3g} "
+            f"beyond {1 / (2 * np.pi * found.memory):.2g} Hz: friction with a memory has no viscous bound"
         )
     return None
 
@@ -91,13 +91,13 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
-    """Return the highest speed [m/s] (99.5 % of samples), the damping [N s/m] lost up to this speed, and its error.
+    """Return the speed [m/s] that 99.5 % of samples do not exceed, the damping [N s/m] lost up to it, and its error.
 
     The standard error is infinite where fewer than _FEW strokes count.
     """
     import scipy
 
-    n = max(3, round(6e-3 / T) | 1)  # At 3 Hz, cubics over 6 ms fit to far below a count.
+    n = max(3, round(6e-3 / T) | 1)  # At 3 Hz, cubics over 7 to 8 ms fit to far below an encoder count.
     smooth = scipy.signal.savgol_filter(x, n + 2, 3)
     v = scipy.signal.savgol_filter(x, n + 2, 3, deriv=1, delta=T)
     top = float(np.percentile(np.abs(v), 99.5))
@@ -163,8 +163,8 @@ class Spectra:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c, end] and a memory of `tau` [s].
 
         m1 and m2 [kg] are motor and handle, k [N/m] and d [N s/m] the transmission between them. The model assumes
-        that a force `end` [N] in one more tick stops the motion left at the end of the record. A shorter p is filled up
-        with zeros.
+        that, after the record, a force `end` [N] of one tick stops the remaining motion. A shorter p is filled up with
+        zeros.
         """
         (m1, m2, k, d), (b, lag, late, c, end), s = *_parameters(p), self._s
         link = k + d * s
@@ -176,7 +176,7 @@ class Spectra:
         """Return the exact derivatives (frequencies, len(p)) of `model` with respect to p."""
         (m1, m2, k, d), (b, lag, late, c, end), s = *_parameters(p), self._s
         link, memory = k + d * s, 1 / (1 + tau * s)
-        still = np.zeros_like(s) if self.held else link / (m2 * s * s + link)  # the handle's part of the motor's motion
+        still = np.zeros_like(s) if self.held else link / (m2 * s * s + link)  # the handle's motion over the motor's
         moving = 1 - still
         impedance = m1 * s + b + c * memory + moving * link / s
         response = self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)
@@ -205,7 +205,7 @@ def _parameters(p: Array) -> tuple[Array, Array]:
 
 
 def fitted(error: Any, jacobian: Any, start: Array, bounds: tuple[Array, Array], steps: int, **more: Any) -> Any:
-    """Fit p by least squares from `start`, which is moved 1e-13 inside the `bounds`; `more` is for scipy."""
+    """Fit p by least squares from `start`, clipped to 1e-13 inside the `bounds`; `more` is for scipy."""
     import scipy
 
     begin = np.clip(start, bounds[0] + 1e-13, bounds[1] - 1e-13)

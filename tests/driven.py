@@ -22,7 +22,7 @@ class Driven:
 def driven(
     process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
-    """Close the loop from plant states `start`, (2n, nsim). With `last`, store only blocks of the last `last` ticks."""
+    """Close the loop from plant states `start`, (2n, nsim). With `last`, store only the blocks of the final ticks."""
     blocks = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:

@@ -266,3 +266,10 @@ def test_an_own_limiter_counts_once_it_is_proved(loop, base, shipped):
     assert verify(Stored.of(loop, SOFT, certificate), own).proved
     rho = certificate.multipliers | {"rho": tuple(2 * r for r in certificate.multipliers["rho"])}
     assert not verify(Stored.of(loop, SOFT, sealed(change(certificate, multipliers=rho))), own).proved
+
+
+def test_certify_takes_own_conditions_only():
+    """A name would be ignored, because the result has all conditions that have a name."""
+    loop = load().loop("I")
+    with pytest.raises(TypeError, match=r"^condition is 'foo' \(str\), expected your own Condition"):
+        certify(loop, SOFT, "foo")

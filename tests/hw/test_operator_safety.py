@@ -286,7 +286,7 @@ def rehearsal_until_finished(scenario, link_couplings):
 
 
 @pytest.mark.parametrize(("by_cap", "advice"), [(True, "raise --force-cap"), (False, "Raise --energy-budget")])
-def test_a_second_of_cut_forces_stops_sessions(scenario, link_couplings, by_cap, advice):
+def test_forces_cut_over_half_a_second_stop_sessions(scenario, link_couplings, by_cap, advice):
     """A session ends as stopped if cap or budget reduced the forces in over half of the 833 ticks of any second."""
     session = rehearsal_until_finished(scenario, link_couplings)
     for cut, stage in ((400, "finished"), (450, "stopped")):
