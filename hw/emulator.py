@@ -209,7 +209,9 @@ class _EmulatedPlant:
         self._limits = -limit, limit
         self.motors = slice(self.scene.model.nq, self.scene.model.nq + scenario.channels)  # speeds of motors in s
         self.still = False
-        self.fastest = 0.0  # [m/s] highest speed of any motor so far
+        #: places in s of the speeds of motors and handles
+        self._speeds = [self.scene.model.nq + i for i in {*range(scenario.channels), *self.scene.handles}]
+        self.fastest = 0.0  # [m/s] highest speed of any motor or handle so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
 
     def begin(self) -> None:
@@ -229,7 +231,7 @@ class _EmulatedPlant:
             self._w = self._next_outside() * (not self.still)
         f = np.minimum(np.maximum(f, self._limits[0]), self._limits[1])
         self.s = self._held(share).dot(np.concatenate((self.s, self._w, f)))
-        self.fastest = max(self.fastest, *map(abs, self.s[self.motors].tolist()))
+        self.fastest = max(self.fastest, *map(abs, self.s[self._speeds].tolist()))
 
     def _hold(self, share: float) -> Array:
         held = hold(self._plant, share * self.scenario.T)

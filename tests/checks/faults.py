@@ -505,8 +505,8 @@ class _FaultOutcome:
     stage: str
     cause: str
     peak_force_n: float  # of any motor
-    peak_speed: float  # [m/s] of any handle
-    free_speed: float  # [m/s] of any handle if nobody holds the faulty device, under the default force cap
+    peak_speed: float  # [m/s] of any motor or handle
+    free_speed: float  # [m/s] of any motor or handle if nobody holds the faulty device, under the default force cap
     zero_force_ms: float | None  # from _WHEN on; None: not measured, or never
     allowed_ms: float | None
     wrong: tuple[str, ...]  # empty if all went as required

@@ -113,6 +113,13 @@ def test_a_cable_pulled_after_the_end_changes_nothing(scenario, link_couplings):
     assert rehearsal.run(1e-6 * rehearsal.armed_us + 0.6).stage == Stage.STOPPED
 
 
+def test_peak_speeds_count_handles(scenario):
+    plant = Emulator(scenario).plant
+    plant.s[plant.scene.model.nq + plant.scene.handles[1]] = 1.0  # [m/s], while the motor rests
+    plant.advance(np.zeros(2))
+    assert plant.fastest > 0.9
+
+
 def test_devices_with_free_handles_are_armed(scenario, link_couplings):
     """A device that nobody holds is armed, so tests/checks/faults.py prints true speeds of free handles."""
     session = _rehearse_case(CASES[0], scenario, link_couplings, free=True)[0].session
