@@ -35,6 +35,9 @@ _ALIVE = 0.06
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
 _ZONE = 0.8  # least ratio of motion / expected motion to its value under twice the force; 1 without a dead zone
 _CLEAN, _RUBBED = 0.15, 0.25  # a dead zone is judged up to this one-sided share, and up to this ratio friction / force
+#: largest ratio of friction at rest to friction in motion; least motion in one pulse, as a share of the motion in a
+#: block (1/3 for a free mass)
+_STICKS, _SLID = 2.0, 0.3
 #: a one-sided fault must explain this multiple of the squares that remain unexplained; friction and weight reach 6
 _BETTER = 8.0
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
@@ -274,7 +277,8 @@ class EncoderTest:
     stronger forces follow until the error of the delay is small enough, or the delay is not tested (`remarks`). A fit
     of dry friction finds a motor that is weak, or an encoder that loses counts, in one direction, because friction
     under a weight gives other shapes. Under twice the force, a motor with a dead zone makes much more than twice the
-    motion; with low friction alone the motion is about twice as large.
+    motion; with low friction alone the motion is about twice as large. A motor is also dead at small forces if a block
+    does not move the axis, but twice the friction that the last block shows could not have held it.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
@@ -318,6 +322,7 @@ class EncoderTest:
         self._pushed = 0.0  # [N] largest force on the axis in this block
         self._finding: str | None = None  # the verdict of the last block
         self._swings = False  # whether the axis swung at the frequency of the force in a block
+        self._stuck = 0.0, 0.0  # strongest force [N] that did not move the axis, and the motion [m] expected of it
         self._weaker = math.nan  # upper bound of the last block's relative size without friction; nan if uncertain
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
@@ -376,6 +381,8 @@ class EncoderTest:
         size, moves, weaker, self._weaker = float(block.size[axis]), block.moves[axis], self._weaker, math.nan
         others = [i + 1 for i in np.flatnonzero(block.follows & (abs(block.size) > _CROSS)).tolist() if i != axis]
         self._swings |= bool(moves and block.swings)
+        if not moves:
+            self._stuck = self._pushed, float(block.reach)
         if not (block.follows[axis] and block.swings):
             return f"a force on {name} moves encoder {others[0]}: axes are swapped" if others and not moves else None
         delay, *fits = block.fits()
@@ -423,8 +430,13 @@ class EncoderTest:
         if doubt >= _LATE:
             coarse = f"counts of {1e3 * self._units.encoder_step[axis]:.3g} mm show it to {doubt:.1f} ticks only"
             self.remarks.append(f"a hidden delay of {name} is not tested: {coarse}")
-        if weaker < _ZONE * own and abs(friction) + doubts[2] < _RUBBED * self._pushed and not self._closing:
-            than = f"{weaker / own:.2g} times as far as expected of its motion under twice the force"
+        stuck, reach = self._stuck
+        slip = stuck - _STICKS * (abs(friction) + doubts[2])  # [N] force that friction at rest leaves to the axis
+        faint = 2 * self._axes.still[axis] * self._units.encoder_step[axis]
+        dead = slip > 0 and _SLID * reach * slip / stuck > faint
+        zone = weaker < _ZONE * own and abs(friction) + doubts[2] < _RUBBED * self._pushed
+        if (dead or zone) and not self._closing:
+            than = f"{0.0 if dead else weaker / own:.2g} times as far as expected of its motion under twice the force"
             return f"{name} moves {than}, and not because of dry friction: its motor has a dead zone"
         self.sizes.append((size, sided))
         return ""

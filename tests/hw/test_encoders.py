@@ -283,6 +283,37 @@ def test_a_dead_zone_is_named(zone, friction, q):
         played(arming_test(q=q), zoned)
 
 
+def sticking(motor, friction, rest, q=1e-6):
+    """Return a `motion` of two free masses of 0.25 kg, in eighths of a tick; `rest` [N] is their friction at rest."""
+    x, v = np.zeros(2), np.zeros(2)
+
+    def motion(k, applied):
+        for _ in range(8 * (k > 0)):
+            push = motor(applied[-1] * STEP)
+            moved = v + push * T / 2
+            moved = np.sign(moved) * np.maximum(np.abs(moved) - friction * T / 2, 0.0)
+            stops = np.where(v == 0, np.abs(push) <= rest, moved * v < 0)
+            v[:] = np.where(stops, 0.0, moved)
+            x[:] += v * T / 8
+        return tuple(round(one / q) for one in x)
+
+    return motion
+
+
+@pytest.mark.parametrize(("band", "friction"), [(1.25, 0.0), (1.25, 0.2), (0.3, 0.05)])
+def test_a_dead_band_is_named(band, friction):
+    """An H-bridge makes no force below `band` [N], and all of it above: friction would not have held the axis."""
+    banded = sticking(lambda force: np.where(np.abs(force) > band, force, 0.0), friction, friction)
+    with expect_stop("dead zone: 1 0$"):
+        played(arming_test(), banded)
+
+
+@pytest.mark.parametrize(("friction", "q"), checkered([0.1, 0.17, 0.25, 0.34, 0.45], [1e-6, 1e-5, 5e-5]))
+def test_friction_at_rest_is_no_dead_band(friction, q):
+    """Friction at rest is twice as large as in motion, so weak blocks do not move the axis at all."""
+    played(arming_test(q=q), sticking(lambda force: force, friction, min(2 * friction, 0.6), q))
+
+
 @pytest.mark.parametrize(("most", "mass"), [(0.6, 0.25), (0.9, 0.15), (9.0, 0.15)])
 def test_a_saturated_motor_fails_the_last_test(most, mass):
     """0.15 kg move 1.2 times as far under 0.9 N as 0.25 kg under 1.3 N; the motion at arming reveals the weak motor."""
