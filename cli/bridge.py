@@ -232,8 +232,8 @@ def _cap_words(scenario: Scenario, caps: Sequence[float], chosen: float | None) 
     if fastest <= FREE_SPEED:
         return f"{newtons} (--force-cap)"
     axis, enough = speeds.index(fastest), scenario.delta[speeds.index(fastest)] * FREE_SPEED / scenario.lever**2
-    if_wrong = f"if a force is wrong, a free handle of axis {axis + 1} moves at up to {fastest:.3g} metres per second"
-    return f"{newtons}; {if_wrong}: --force-cap {math.floor(100 * enough) / 100:g} keeps it below {most}"
+    constant = f"a constant force moves a free handle of axis {axis + 1} at up to {fastest:.3g} metres per second"
+    return f"{newtons}; {constant}, and with --force-cap {math.floor(100 * enough) / 100:g} at up to {most}"
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:

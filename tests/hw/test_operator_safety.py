@@ -83,7 +83,7 @@ def test_force_caps_are_explained():
     """A force F moves a free handle at F/b; a torque r F moves the rim of a wheel at r^2 F/b, with b in N m s/rad."""
     three, wheel = load("three-rigid"), load("omega-pair").replace(unit="rad", radius=0.2)
     assert "at most 1.3, 0.8, 1.3 newtons (default: " in bridge._cap_words(three, [1.3, 0.8, 1.3], None)
-    assert "axis 2 moves at up to 1.62 metres per second: --force-cap 0.8 " in bridge._cap_words(three, [1.3] * 3, 1.3)
+    assert "up to 1.62 metres per second, and with --force-cap 0.8 " in bridge._cap_words(three, [1.3] * 3, 1.3)
     assert bridge._cap_words(three, [0.8] * 3, 0.8) == "forces at the hand are at most 0.8 newtons (--force-cap)"
     assert bridge._cap_words(wheel, [0.2 * 1.3] * 2, 1.3).endswith(" at most 1.3, 1.3 newtons (--force-cap)")
     assert "--force-cap 34.2" in bridge._cap_words(wheel, [0.2 * 35, 0.2 * 30], 35.0)
