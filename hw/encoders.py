@@ -436,7 +436,7 @@ class EncoderTest:
         dead = slip > 0 and _SLID * reach * slip / stuck > faint
         zone = weaker < _ZONE * own and abs(friction) + doubts[2] < _RUBBED * self._pushed
         if (dead or zone) and not self._closing:
-            than = f"{0.0 if dead else weaker / own:.2g} times as far as expected of its motion under twice the force"
+            than = f"{weaker / own if zone else 0.0:.2g} times as far as expected of its motion under twice the force"
             return f"{name} moves {than}, and not because of dry friction: its motor has a dead zone"
         self.sizes.append((size, sided))
         return ""
