@@ -105,9 +105,9 @@ def rows(matrix: Array) -> str:
         (
             "",
             ', {between = ["left", "ground"], stiffness = 1.0, along = [0, 0, 0]}',
-            ("springs #3: along", "one above"),
+            ("springs #3: along", "1e-9"),
         ),
-        ("", ', {between = ["left", "ground"], stiffness = 1.0, along = []}', ("springs #3: along", "[]", "one above")),
+        ("", ', {between = ["left", "ground"], stiffness = 1.0, along = []}', ("springs #3: along", "[]", "1e-9")),
         ("", ', {between = ["left", "ground"], stiffness = 1.0, along = [1, 0]}', ("along", "expected 3 numbers")),
         ("", ', {between = ["left", "ground"], stiffness = [1, 2]}', ("springs #3.stiffness is [1, 2]", "3 numbers")),
         ("", ', {between = ["left", "ground"], stiffness = [1, 1, -2]}', ("springs #3.stiffness", "eigenvalue -2")),
