@@ -353,7 +353,7 @@ def audit(
     seed: int = 0,
     progress: Progress = lambda done, total: None,
 ) -> Audit:
-    """Return the assessment of a coupling, its margins to the edge of each condition, and changes that would help.
+    """Audit a coupling: assess it, compute how far each condition is from failing, and search changes that help.
 
     Args:
         loop: The loop, with the range of switching delays, if any.

@@ -117,7 +117,7 @@ def _target(path: Path) -> Path:
 
 @contextmanager
 def _refusing(what: str, hint: str = "") -> Iterator[None]:
-    """Raise an InputError that begins with `what` in place of an OSError."""
+    """Turn an OSError in the block into an InputError. Its message begins with `what`."""
     try:
         yield
     except OSError as error:

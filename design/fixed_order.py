@@ -251,10 +251,10 @@ _START_ROOM = 1e-3  # unused share of the damping of the first coupling, so that
 
 
 def design(loop: Loop, order: int = 1, most_sdps: int = budgets.FIXED_ORDER_PROBLEMS) -> Design:
-    """Return a coupling with `order` states per channel, by a descent of at most `most_sdps` steps.
+    """Design a coupling with `order` states per channel.
 
-    The descent starts at a spring-damper. Raises Infeasible if Theorem 4 admits none, and DesignFailed if no coupling
-    is certified.
+    The search starts at a spring-damper and solves at most `most_sdps` convex problems. Raises
+    Infeasible if Theorem 4 admits no coupling, and DesignFailed if no coupling is certified.
     """
     whole("order", order, 1, _MOST_STATES)
     shaping, phi = lmi.Shaping(loop), least_phi(loop)

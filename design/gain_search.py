@@ -62,10 +62,10 @@ class _Responses:
         self._last: tuple[Array, Complex, Array | Complex] | None = None
 
     def around(self, gains: Array) -> tuple[Complex, Array | Complex]:
-        """Return G = (I + Psi E V)^-1 Psi E, (k, m, m), and `by` (2, k, m), the factors in the derivatives of G.
+        """Return G = (I + Psi E V)^-1 Psi E (k, m, m) at k frequencies, and factors `by` (2, k, m) of its derivatives.
 
-        At frequency k, dG/d(log K_i) is by[0, k, i] times column i of G times row i of G. For B_i/delta_i the factor is
-        by[1, k, i].
+        At frequency k, dG/d(log K_i) is by[0, k, i] times column i of G times row i of G. The derivative by B_i/delta_i
+        has the factor by[1, k, i].
         """
         if self._last is None or not np.array_equal(self._last[0], gains):
             log_k, b = np.split(gains, 2)

@@ -67,7 +67,7 @@ class Shaping:
         return np.concatenate([[0.0], frequencies(self.environment, self.W2, *systems)])
 
     def gain(self, V: Lti, w: Array) -> Array:
-        """Return sigma_max of L W2, (k,), at w (k,) [rad/sample]."""
+        """Return the largest singular value of L W2 at each frequency w [rad/sample]; w and result have shape (k,)."""
         environment, weight, late = self.parts(w)
         return np.linalg.norm((environment @ V.at(on_circle(w)) + late) @ weight, 2, axis=(1, 2))
 

@@ -143,8 +143,8 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
         return None
     equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
     if walls and not equal:
-        # With walls the share is necessary but not sufficient. With unequal devices it is sufficient but not necessary.
-        # With both it is neither.
+        # With walls Theorem A is necessary but not sufficient. For unequal devices it is sufficient but not necessary.
+        # For unequal devices with walls it is neither necessary nor sufficient.
         return None
     try:
         maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]

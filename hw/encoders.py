@@ -25,7 +25,8 @@ _TEST_SPEED = 0.1  # [m/s] speed in the last test, whose force may exceed _TEST_
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio of a motion to the expected motion, or of the expected motion to it
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 2e-5 of a motion at 2 Hz
-#: least share of power in the expected shape; loosely moved handles have 0.93, held compliant devices at most 0.5
+#: A motion has the expected shape if a multiple of that shape makes up this share of its sum of squares. The share is
+#: 0.93 for loosely held handles, and at most 0.5 for compliant devices whose handle is held firmly.
 _FIT = 0.8
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but no certificate covers a whole tick
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less

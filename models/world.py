@@ -560,7 +560,7 @@ class Rows:
 
     force: Array  # (rows,) [N]
     after: Array  # (rows,) w+, the speed after the step [m/s]; w is the speed before it
-    depth: Array  # (rows,) r, a signed distance, negative in penetration [m]
+    depth: Array  # (rows,) r, the distance to the contact or limit [m]; it is negative beyond it
     D: Array  # (rows,) inverse regularisation of the row's law f = -D ((w+ - w)/h + b w+ + K (r + h w+)) [kg]
     K: Array  # (rows,) reference stiffness [1/s^2]
     b: Array  # (rows,) reference damping [1/s]

@@ -437,10 +437,11 @@ class CrossCheck:
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
-    """Repeat the run with RK4, or with the exponential integrator if RK4 ran, and return how much both runs differ.
+    """Repeat the run with another integrator, and return the differences of the two runs.
 
-    RK4 uses no matrix of the other engines, except for impedances of hands. `simulation` is the loop that ran, with its
-    passivity layer. Positions are compared up to the end of the shorter run.
+    The other integrator is RK4, or the exponential one if the run used RK4. RK4 uses no matrix of the other engines,
+    except for impedances of hands. `simulation` is the loop that ran, with its passivity layer. Positions are compared
+    up to the end of the shorter run.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even

@@ -191,7 +191,7 @@ class Trace(ReadOnly):
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Return the trace with the arrays of its file. Raises InputError if the arrays are no trace."""
+        """Return the trace that these arrays of a file describe. Raises InputError if they describe none."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             names = tuple(str(name) for name in arrays.get("names", np.zeros(0)))

@@ -157,7 +157,7 @@ class _Simulated:
 class MapReport:
     """The report of a map. An array's rows are stiffnesses. Null means infinite, not applicable, or not computed."""
 
-    rigid: bool  # whether the first device alone faces a rigid wall
+    rigid: bool  # True for a map of one device, the first, at a rigid wall
     scenario: str | None
     scenario_digest: str
     T: float

@@ -146,7 +146,7 @@ def test_every_combination_is_proved_stored_and_verified(names):
 
 
 def test_limited_walls_agree_with_a_block_by_hand():
-    """With the multipliers of the search, `block_by_hand` is positive at 1.001 of the requirement, but not at 0.999."""
+    """With the multipliers of the search, the block by hand is positive at 1.001 of the requirement, not at 0.999."""
     loop, rho = combined(("walls", "limiter"))
     needs = required_damping(loop, COUPLING, LimitedForces(held=(rho,)))
     binding = max(2 * np.pi * loop.T * needs.frequency_hz, 1e-3)

@@ -261,7 +261,7 @@ def test_the_loop_runs_during_a_design(none):
     later.work()
     delayed = running.frame(0.3).prepared
     assert delayed.scenario.theta == (2, 3)
-    assert delayed.coupling is designed.coupling  # The coupling stays the same when the delay changes.
+    assert delayed.coupling is designed.coupling
 
 
 def test_a_push_is_felt_until_the_next(none):
