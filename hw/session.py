@@ -186,7 +186,8 @@ class Session:
         return () if self.stage in ENDED else self._end(stage, cause)
 
     def retract(self, doubt: str) -> None:
-        """Change the end of a session from finished to stopped, and add `doubt` to the cause."""
+        """Change the end of a session from finished to stopped, also in its log, and add `doubt` to the cause."""
+        self.log = [event for event in self.log if event.stage != Stage.FINISHED]
         self._enter(Stage.STOPPED, f"{self.cause}, but {doubt}")
 
     def estop(self, cause: str, now: int) -> Said:

@@ -297,6 +297,7 @@ def test_forces_cut_over_half_a_second_stop_sessions(scenario, link_couplings, b
             row = TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state, limited=within and not by_cap)
             recorder(row)
         assert outcome("I", session, recorder, 0).session.stage == stage
+    assert Stage.FINISHED not in [event.stage for event in session.log]
     assert advice in session.cause
 
 
