@@ -328,7 +328,8 @@ def _ask_for_clamp(axes: str) -> None:
         answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold the undriven axes? [y/n] ")
         if answer.strip().lower() in ("y", "yes"):
             return
-    raise InputError(f"--port: no channel drives {axes}; {library}: clamp them mechanically and give --clamped")
+    ways = "clamp them mechanically and give --clamped, or hold them by springs, as --scenario omega-held does"
+    raise InputError(f"--port: no channel drives {axes}; {library}: {ways}")
 
 
 def _rehearsed(

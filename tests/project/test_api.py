@@ -118,6 +118,20 @@ def test_rehearsed_sessions_finish_with_their_guarantee():
     assert soft.assessment.requirements["this-environment"].certified
 
 
+@pytest.mark.slow
+def test_springs_hold_the_axes_without_clamps():
+    """Hands move y of the left and z of the right device by 3 mm; the held axes follow the closed form of a sine."""
+    session = rehearse(load("omega-held"), seconds=4.0)
+    assert session.stage == "finished"
+    w, hand = 2 * np.pi * 0.6, 200.0 + 3.0j * 2 * np.pi * 0.6
+    t, x = session.result.t, session.result.x
+    cycle = x[(t >= 2.2) & (t < 2.2 + 1 / 0.6)]  # one period of the hands, at full gain
+    for channel, hold in ((1, 400.0), (5, 300.0)):
+        motion = 0.003 / np.hypot(1.0, 0.2) * abs(hand / (hand + hold + 1j * w * (1.0 + 1.37) - w**2 * (0.3 + 0.25)))
+        assert np.ptp(cycle[:, channel]) / 2 == pytest.approx(motion, rel=0.02)
+    assert np.abs(cycle[:, [2, 4]]).max() < 1e-6
+
+
 def test_a_session_that_is_refused_says_why():
     session = rehearse(load().replace(T=1e-3, theta=(1, 1)), SpringDamper([2e4, 2e4], [1.0, 1.0]), seconds=0.5)
     assert session.stage == "refused"

@@ -96,7 +96,7 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nix.toml", "No such file or directory; give a TOML file or one of: omega-pair"),
+        ("nix.toml", "No such file or directory; give a TOML file or one of: omega-held, omega-pair"),
         (".", "is a folder, expected a file"),
     ],
 )
