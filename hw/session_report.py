@@ -270,7 +270,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
         if plot:
             from haptic_loop.sim.plots import draw_run, save
 
-            title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"
+            title = f"{report.scenario}, case {report.case}: a session that ended as {session.stage}"
             files.append(save(draw_run(result.signals, title, 10.0), out / "figure.png"))
     files.append(out / "report.json")
     write_json(files[-1], plain(report) | {"files": [str(p) for p in files]})

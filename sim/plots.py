@@ -271,6 +271,11 @@ def _two_points(result: Signals) -> bool:
     return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
 
 
+def _handles_known(result: Signals) -> bool:
+    """Return whether the displacements of the handles are known; a session measures those of the encoders only."""
+    return not np.isnan(result.x_handle).any()
+
+
 def _calmest_last(values: Array) -> list[int]:
     """Return the channels in the order of drawing: those that change fastest first."""
     return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
@@ -301,7 +306,9 @@ def _stands_out(result: Signals, near: slice, ticks: int) -> bool:
 
 
 def _one_point(result: Signals) -> str:
-    """Return the label of the displacement axis for curves that show handle and encoder at once."""
+    """Return the label of the displacement axis, if each curve shows handle and encoder at once, or an encoder."""
+    if not _handles_known(result):
+        return "displacement of the encoder [mm]"
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
@@ -322,15 +329,19 @@ def _draw_walls(axes: Array, result: Signals, around: Contacts) -> None:
 
 
 def _draw_displacements(axes: Array, result: Signals, parts: tuple[slice, ...], around: Contacts) -> None:
-    """Draw encoders and, over them, handles [mm]; if both look the same in the picture, draw only handles."""
+    """Draw encoders and, over them, handles [mm].
+
+    If both look the same in the picture, draw only handles; if handles were not measured (nan), draw only encoders.
+    """
     two, alike = _two_points(result), _coinciding(result.x, around)
+    one = result.x_handle if _handles_known(result) else result.x
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
             style = STYLES[i % len(STYLES)]
             label = f"{around.name(i)}, encoder (thin)" if two else around.name(i)
             if alike[i] and not two:
                 label += f", displacement{alike[i]}"
-            thin, x = (0.5 * width, result.x) if two else (width, result.x_handle)
+            thin, x = (0.5 * width, result.x) if two else (width, one)
             axis.plot(result.t[part], 1e3 * x[part, i], label=label, linewidth=thin, **style)
         if two:
             for i in _calmest_last(result.x_handle):

@@ -37,6 +37,15 @@ def drawn(monkeypatch, tmp_path):
     return draw
 
 
+def test_sessions_without_handles_show_their_encoders(drawn):
+    x = np.sin(np.arange(3000) / 300)[:, None] * [1e-3, 2e-3]
+    run = replace(trace(1e3 * x, x), x_handle=np.full_like(x, np.nan))
+    (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
+    assert axis.get_ylabel() == "displacement of the encoder [mm]"
+    for i in range(2):
+        np.testing.assert_array_equal(lines(axis)[f"device {i + 1}"][:, 1], 1e3 * x[:, i])
+
+
 @pytest.fixture
 def undrawn(monkeypatch):
     """Return a function that makes a picture without drawing its pixels, and returns its figure."""
