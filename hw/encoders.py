@@ -47,7 +47,9 @@ ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as 
 _SETTLED, _CALM = 0.5, 5e-4  # [s] rest before and after a person moves an axis; [m] largest motion in a rest
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # least force in units of `_newton`; longest time [s] of rest under such a force
-_TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser counts the encoder looks dead
+#: [m] least motion of a calm hand within _PRESSED; the hand drifts like a random walk, so n times the motion takes n^2
+#: times as long
+_TREMOR = 3e-5
 
 
 class EncoderNoise:
@@ -474,9 +476,10 @@ class EncoderMonitor:
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
     of more than 1 N, or of half of a cap below 2 N, are integrated over time. A mass M whose motion a force change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
-    of more than 0.3 N, or 0.15 of a cap below 2 N, no hand holds still for half a second, because it has a tremor. The
-    tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because
-    friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c.
+    of more than 0.3 N, or 0.15 of a cap below 2 N, no hand holds still for half a second, because it has a tremor.
+    Where noise and counts hide more than 30 um of it, this time is longer by the square of the ratio. Handles with dry
+    friction F_c may look dead, because friction holds them while the force changes by 2 F_c (so 1 N allows F_c =
+    0.5 N), and hides a tremor below F_c.
     """
 
     def __init__(self, axes: CheckedAxes) -> None:
@@ -485,8 +488,8 @@ class EncoderMonitor:
         #: (m,) [N] unit of force changes: 1 N, or half of a cap below 2 N
         self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]
         self._band: list[list[int]] | None = None
-        tremor = _TREMOR / limits.lever
-        self._shown = [(n + 1) * q <= tremor for n, q in zip(axes.still, axes.units.encoder_step, strict=True)]
+        hidden = [(n + 1) * q * limits.lever for n, q in zip(axes.still, axes.units.encoder_step, strict=True)]
+        self._longest = [_PRESSED * max(1.0, (x / _TREMOR) ** 2) for x in hidden]  # (m,) [s] longest rest under a force
         self._quiet = [0.0] * m  # [s] time under a force without a motion that shows a tremor
         self._reference = [0.0] * m  # [N] force at the last motion
         self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion
@@ -513,13 +516,13 @@ class EncoderMonitor:
                 if self._impulse[i] > max(_IMPULSE * newton, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                     doing = f"it stands still while the force changes by {change:.3g} N"
                     raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
-            pressed = self._shown[i] and abs(force) > _PRESSING * newton
+            pressed = abs(force) > _PRESSING * newton
             self._quiet[i] = self._quiet[i] + ticks * self._T if pressed else 0.0
 
     @property
     def dead(self) -> str | None:
         """Return a message about an encoder that stands still under a long force, or None."""
-        for i, seconds in enumerate(self._quiet):
-            if seconds > _PRESSED:
-                return f"encoder or motor of axis {i + 1} is dead: nothing moves for {_PRESSED:g} s under a force"
+        for i, (seconds, longest) in enumerate(zip(self._quiet, self._longest, strict=True)):
+            if seconds > longest:
+                return f"encoder or motor of axis {i + 1} is dead: nothing moves for {longest:.2g} s under a force"
         return None

@@ -547,13 +547,14 @@ def test_still_encoders_under_force_are_dead(newton, found):
     assert (monitor.dead is not None and cause_of(monitor.dead) == "still handle: 1 0.5") == found
 
 
-@pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
-def test_coarse_counts_hide_a_calm_tremor(count, dead):
-    """A tremor of 30 um always spans more than two counts of 15 um, but it fits into two counts of 16 um or more."""
+@pytest.mark.parametrize(("count", "longest"), [(1.5e-5, 0.5), (1.89e-5, 0.79), (6.35e-5, 8.96)])
+def test_coarse_counts_hide_a_calm_tremor(count, longest):
+    """A hand that moves 30 um in 0.5 s, and drifts like a random walk, leaves two counts within `longest` seconds."""
     monitor = monitor_of(count)
-    for _ in range(round(0.6 / T)):
-        monitor.check((0,), (1250,), 1)  # 0.5 N
-    assert (monitor.dead is not None) == dead
+    for seconds, dead in ((0.98 * longest, False), (0.04 * longest, True)):
+        for _ in range(round(seconds / T)):
+            monitor.check((0,), (1250,), 1)  # 0.5 N
+        assert (monitor.dead is not None) == dead
 
 
 @pytest.mark.parametrize("cap", [pytest.param(0.3, marks=pytest.mark.slow), 0.4])
