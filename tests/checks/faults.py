@@ -528,7 +528,8 @@ def rehearse_faults() -> list[_FaultOutcome]:
         (scenario, scenario.replace(device=tuple(limits)), STRONGEST, CASES)
     ]
     for name, axis in _WEAK.items():
-        weak = _lively(load(str(_ROOT / name) if name.endswith(".toml") else name), _AMPLITUDE)
+        weak = load(str(_ROOT / name) if name.endswith(".toml") else name)
+        weak = _lively(weak.replace(human=load().human[:1] * len(weak.device)), _AMPLITUDE)
         runs.append((weak, weak, None, _weak_cases(name, axis)))
     outcomes = []
     for held, free, cap, cases in runs:
