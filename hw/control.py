@@ -615,6 +615,7 @@ def certified_coupling(request: CouplingRequest, link: int) -> CertifiedCoupling
 def certified_couplings(request: CouplingRequest, link: int, spare: int = 2) -> tuple[CertifiedCoupling, ...]:
     """Return the coupling for the measured delay, and up to `spare` reserves, each for a link slower by one tick.
 
+    Where forces act on arrival, there is one reserve, for latencies up to almost a tick.
     A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on no
     channel. It needs less damping than the previous coupling would need with the delays of the reserve. A reserve has
     the kind of the first coupling, or comes from the same file. Where such a reserve is not certified or not softer, a
@@ -629,12 +630,27 @@ def certified_couplings(request: CouplingRequest, link: int, spare: int = 2) -> 
     while len(candidates) <= spare and wanted:
         reserve = None
         with suppress(SafetyStop, InputError):
-            reserve = certified_coupling(wanted[0], candidates[-1].link + 1)
+            reserve = _slower(wanted[0], candidates[-1])
         if reserve and _softer(reserve, candidates[-1]):
             candidates.append(reserve)
         else:
             wanted.pop(0)
     return tuple(candidates)
+
+
+_LATEST = 0.95  # largest latency that a reserve is designed for, as a share of the shortest period
+
+
+def _slower(request: CouplingRequest, than: CertifiedCoupling) -> CertifiedCoupling:
+    """Return the requested coupling for a link slower than that of `than`. Raises SafetyStop or InputError."""
+    scenario = than.scenario
+    if scenario.latency is None:
+        return certified_coupling(request, than.link + 1)
+    latest = _LATEST * (scenario.T_min or scenario.T)
+    if max(most for _, most in scenario.latency) >= latest:
+        raise SafetyStop("forces that act on arrival must arrive within their tick")
+    spans = tuple((least, latest) for least, _ in scenario.latency)
+    return certified_coupling(replace(request, scenario=request.scenario.replace(latency=spans)), than.link)
 
 
 _EQUAL = 1e-6  # relative difference up to which static stiffnesses count as equal: a design's search has this tolerance

@@ -117,12 +117,15 @@ class ForceDimension:
         """Return INFO. Only name and serial number are the library's, which reports no damping and no encoder step."""
         return self._info
 
-    def configure(self, config: wire.Config) -> int:
+    def configure(self, config: wire.Config) -> int | None:
         with self._off_after_an_error():
             self._device.configure(config)
             (ack,) = self._decoder.feed(self._device.ack)
             self._device.ack = b""
             assert isinstance(ack, wire.Ack)
+            if ack.refused == wire.Refused.RUNNING:
+                self.exchange(None)  # the next tick of the ramp
+                return None
             if not ack.refused:
                 for index, ID in self._ids.items():
                     self._heeded(self._sdk.setMaxForce(self._strongest(config, index), ID=ID))

@@ -22,7 +22,7 @@ pytestmark = [
 SESSION = """
 import ctypes, json, sys
 from haptic_loop.hw.force_dimension import ForceDimension, library
-from haptic_loop.hw.protocol import Command, Config, Force, SafetyStop
+from haptic_loop.hw.protocol import Command, Config, Force, Reason, SafetyStop
 from haptic_loop.sim.scenario import load
 stub, sdk, now = ctypes.CDLL(sys.argv[1]), library(), [0.0]
 stub.stub_force.restype = stub.stub_limit.restype = ctypes.c_double
@@ -45,6 +45,9 @@ with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
         state = device.exchange(Force(Command.ARM if k < 2 else Command.RUN, state.tick, state.tick, force))
     said["forces"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
     said["limits"] = [stub.stub_limit(1), stub.stub_limit(0)]
+    device.stop(Reason.DONE)
+    ramped = [device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000))) for _ in range(6)]
+    said["ramped"] = [ramped, stub.stub_force(1, 0)]
     said["watchdogs"] = [stub.stub_watchdog(0), stub.stub_watchdog(1)]
 for index, value in ((3, 1), (9, 7), (0, 0), (1, 0), (5, 0), (5, 99)):
     with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
@@ -126,6 +129,10 @@ def test_forces_reach_the_axes_they_are_for(session):
     assert session["refused"] == 0
     assert session["forces"] == pytest.approx([0.4, -0.2])  # 1000 and -500 steps of 0.4 mN
     assert session["limits"] == pytest.approx([2.02, 1.01])  # 1 % above the caps of 2 and 1 N
+
+
+def test_a_configuration_waits_for_the_ramp(session):
+    assert session["ramped"] == [[None] * 5 + [0], 0.0]  # a ramp of five ticks
 
 
 def test_three_axes_of_a_device_share_a_limit(session):

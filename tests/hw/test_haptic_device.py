@@ -139,7 +139,7 @@ class StandIn:
 SOFT = SpringDamper([400.0, 400.0], [0.2, 0.2])
 
 
-def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None, own=None):
+def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None, own=None, spare=0):
     """Run a session of Live with the stand-in to its end; return it, its recorder and its couplings.
 
     The coupling is `own`, or designed for the measured latency.
@@ -151,10 +151,10 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 
         def plan(ages):
             judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
-            couplings.extend(certified_couplings(CouplingRequest(judged, own=own), link, spare=0))
+            couplings.extend(certified_couplings(CouplingRequest(judged, own=own), link, spare=spare))
             return couplings
 
-        live = Live(session, device, plan, Operator(True, seconds), watch=watch)
+        live = Live(session, device, plan, Operator(not spare, seconds), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
     return session, recorder, couplings
@@ -248,6 +248,26 @@ def test_forces_later_than_certified_end_in_a_ramp(scenario):
     assert cause_of(session.cause).startswith("late answers:")
     assert session.counters.late > 20
     assert sdk.force.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.slow
+def test_later_forces_continue_with_a_softer_coupling(scenario):
+    """The reserve's certificate covers the later forces, which still act on arrival."""
+    sdk = StandIn(scenario)
+
+    def watch(session):
+        if session.stage == Stage.DISARMED:  # a person presses the key
+            session.arm(session.now)
+        if session.stage == Stage.ARMED:
+            sdk.write = 0.4e-3
+
+    session, _, couplings = held_session(scenario, sdk, seconds=1.0, watch=watch, spare=2)
+    assert (session.stage, cause_of(session.cause)) == (Stage.FINISHED, "time:")
+    first, softer = couplings
+    assert [arming.program for arming in session.armings] == [first, softer]
+    assert max(first.chosen.coupling.K) > 2 * max(softer.chosen.coupling.K)
+    assert first.link == softer.link == 0
+    assert softer.scenario.latency[0] == pytest.approx((first.scenario.latency[0][0], 0.95 * T))
 
 
 @pytest.mark.slow
