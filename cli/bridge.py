@@ -109,6 +109,9 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
         stored_coupling(scenario, args.coupling)  # Refuse a bad file before the link is measured.
     arrival = "--latch arrival"
     if session_cli.host_clocked(args):
+        if args.latch == "tick":
+            acts = "a force acts when the host writes it, not at a tick"
+            raise InputError(f"--latch tick with --port {args.port}: {acts}; leave --latch out")
         arrival = f"--port {args.port}, whose forces latch on arrival"
     if at_once and args.condition:
         choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
@@ -148,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     latch = (
         "when forces act: at whole ticks (default), or on arrival with a certified latency (always for force-dimension)"
     )
-    parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
+    parser.add_argument("--latch", choices=("tick", "arrival"), help=latch)
     parser.add_energy_budget()
     parser.add_limiter()
     seconds, most = "time at full gain (default: the scenario's)", options.number(0.1, _LONGEST)

@@ -50,7 +50,9 @@ def add_link_options(parser: options.Parser) -> None:
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
-    port += f"{FORCE_DIMENSION}[:0x,1x]: index of a device and letter of its axis, for each channel"
+    port += (
+        f"{FORCE_DIMENSION}[:0x,sn4711x]: index or serial number of a device and letter of its axis, for each channel"
+    )
     add("--port", metavar="PATH", help=port)
     virtual = "run the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
@@ -300,7 +302,9 @@ def _logged(session: Session, out: Path) -> IncidentLog:
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
     if host_clocked(args):
-        adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
+        adapter = stack.enter_context(
+            ForceDimension(session.scenario, args.port.partition(":")[2] or None, deadman=session.settings.deadman)
+        )
         if not adapter.guarded:
             console(args).print("the device has no watchdog: if this program is killed, the last force stays on")
         if adapter.unused_axes and not args.clamped:
@@ -366,16 +370,16 @@ def _rehearsed(
 def _show(session: Session) -> None:
     """Overwrite the status line, unless the terminal would block."""
     words, drive, counters = [str(session.stage)], session.drive, session.counters
-    words += [session.request] if session.request else []
+    request = [session.request] if session.request else []
     if session.stage == Stage.MEASURING:
         words.append(f"{len(session.measurement.result.values)} of {session.settings.measure} answers")
     elif session.stage == Stage.MEASURED:
         words.append("designing the coupling")
     elif drive and drive.x:
-        words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
+        words += request + [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")
     elif session.info and session.link.last:
-        words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)]
+        words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)] + request
     words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
     words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]
     line = in_unit(" · ".join(words))[: shutil.get_terminal_size().columns - 1]

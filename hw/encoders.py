@@ -104,7 +104,7 @@ class AxisCheck:
             return None
         if not self._origin:
             return f"let every handle rest: axis {self._moving + 1} moves"
-        ask = f"move axis {self._axis + 1} by {1e3 * self._far:.3g} mm or more in its + direction, and hold it there"
+        ask = f"move axis {self._axis + 1} by +{1e3 * self._far:.3g} mm or more and hold it"
         return f"{self._finding}. Go back, then {ask}" if self._wrong else ask
 
     def note(self, counts: tuple[int, ...]) -> str | None:

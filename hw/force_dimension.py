@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr
 from importlib import import_module
 from io import StringIO
+from itertools import combinations
 from typing import Any, Self
 
 from haptic_loop.hw import protocol as wire
@@ -70,10 +71,12 @@ class ForceDimension:
         sdk: Any = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        deadman: bool = False,
     ) -> None:
         """Open the devices that `axes` names, such as "0x,1x" (default: the scenario's axes, on the first devices).
 
-        Raises InputError where `axes` is wrong, the library is missing, or a device cannot be opened.
+        With `deadman`, button 0 of every device is read at every tick. Raises InputError where `axes` is wrong or names
+        a device twice, the library is missing, or a device cannot be opened or has no button to be read.
         """
         self._where = _axes(axes, scenario)
         #: channels whose force limit is that of another channel: all but the first of each limited force vector
@@ -89,6 +92,11 @@ class ForceDimension:
                 if ID < 0:
                     raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {sdk.errorGetLastStr()}")
                 self._ids[name] = ID
+                if deadman and sdk.getButton(0, ID=ID) < 0:
+                    others = "give --deadman key, --deadman FILE or --no-dead-man"
+                    raise InputError(f"--deadman device: the button of device {name} cannot be read; {others}")
+            self._buttons = [*self._ids.values()] if deadman else []
+            self._require_different()
             self._status = {index: self._sdk.Status() for index in self._ids}
             first = next(iter(self._ids.values()))
             name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
@@ -144,6 +152,8 @@ class ForceDimension:
                 self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
             self._due = max(self._due, self._clock() - (1 - _SHORTEST) * self._T) + self._T
             self._check_status()
+            if self._buttons:
+                self._device.deadman = all(self._heeded(self._sdk.getButton(0, ID=ID)) for ID in self._buttons)
             before = self._device.applied
             _, out = self._device.tick(self._now(), self._counts())
             if self._device.applied != before or force is None:
@@ -164,6 +174,14 @@ class ForceDimension:
         for ID in self._ids.values():
             self._sdk.enableForce(False, ID=ID)
             self._sdk.close(ID=ID)
+
+    def _require_different(self) -> None:
+        """Raise InputError if two names open the same device. Devices without a serial number are not compared."""
+        numbers = {name: self._sdk.getSerialNumber(ID=ID) for name, ID in self._ids.items()}
+        for one, other in combinations(numbers, 2):
+            if 0 < numbers[one] == numbers[other]:
+                same = f"{one} and {other} are the same device, serial number {numbers[one]}"
+                raise InputError(f"--port {FORCE_DIMENSION}: {same}; give it one of these names")
 
     def _zero(self) -> None:
         """Set zero force at every device, even if one of them reports an error."""
@@ -203,10 +221,9 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device has no power, no link or an error.
+        """Raise SafetyStop if a device has no power, no link or an error, or is in reset mode.
 
-        An armed device must also not be in reset mode, and its forces must be on. Raises PortLost if a status cannot be
-        read.
+        The forces of an armed device must also be on. Raises PortLost if a status cannot be read.
         """
         armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():
@@ -216,7 +233,7 @@ class ForceDimension:
                 "has no power": not status.power,
                 "is not connected": not status.connected,
                 f"reports error {status.error}": status.error,
-                "is in reset mode: calibrate it": armed and status.reset,
+                "is in reset mode: calibrate it": status.reset,
             }
             if armed and not status.force:
                 names = {cause.value: cause.name.lower() for cause in self._sdk.ForceOffCause}

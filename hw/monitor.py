@@ -203,7 +203,7 @@ class Measurement:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         elapsed, ticks = (state.t_us - self._first.t_us) & 0xFFFFFFFF, distance(state.tick, self._first.tick)
         if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DEVICE_TOLERANCE:
-            each = f"{elapsed / ticks:.1f} us by its own clock, T is {self._T_us:g} us"
+            each = f"{elapsed / ticks:.1f} us by its time stamps, T is {self._T_us:g} us"
             raise SafetyStop(f"a tick of the device lasts {each}")
         if self._sent is None and len(self._answers.inferred) > _INFERRED * len(ages):
             self._apart = max(2, min(self._theta, math.ceil(max(ages.values()) / self._T_us)))
@@ -334,7 +334,7 @@ class LinkMonitor:
 class _ClockDrift:
     """Compare a clock with ticks of `T_us` in blocks. Each block excludes its longest delay, which may be a freeze."""
 
-    whose: str
+    measure: str  # name of the clock in messages
     T_us: float
     tolerance: float  # largest drift, as a part of a block
     forgiven_us: float  # [us] most that a block excludes of its longest delay
@@ -357,7 +357,7 @@ class _ClockDrift:
             if abs(drift) > self.tolerance * _BLOCK * self.T_us:
                 lasts = self.T_us + drift / self._ticks
                 what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
-                raise SafetyStop(f"a tick of the device lasts {lasts:.4g} us by {self.whose} clock {what}")
+                raise SafetyStop(f"a tick of the device lasts {lasts:.4g} us by {self.measure} {what}")
             if self._ticks >= _BLOCK:
                 self._ticks, self._behind, self._freeze = 0, 0.0, 0.0
         self._last = at_us
@@ -369,8 +369,8 @@ class ClockMonitor:
     def __init__(self, watchdog_us: int, T: float) -> None:
         T_us = 1e6 * T
         self.most = max(1, int(watchdog_us / T_us))  # [ticks] largest advance from one STATE to the next
-        self._device = _ClockDrift("its own", T_us, _DEVICE_TOLERANCE, watchdog_us)
-        self._host = _ClockDrift("the host's", T_us, _HOST_TOLERANCE, watchdog_us)
+        self._device = _ClockDrift("its time stamps", T_us, _DEVICE_TOLERANCE, watchdog_us)
+        self._host = _ClockDrift("the host's clock", T_us, _HOST_TOLERANCE, watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
         """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` ticks after the previous one."""

@@ -284,10 +284,10 @@ class Session:
         self._noise.note(state.counts)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
-        if self._axes and self.stage == Stage.DISARMED:
-            if wrong := self._axes.note(state.counts):
+        if self.stage == Stage.DISARMED:
+            if self._axes and (wrong := self._axes.note(state.counts)):
                 return self._end(Stage.REFUSED, wrong)
-            self.request = self._axes.request
+            self.request = self.hindrance
         return self._answer(state, wire.Command.IDLE)
 
     def _on_state_after_the_end(self, state: wire.State) -> Said:

@@ -50,7 +50,7 @@ CAUSES = {
     "force unlike the command": "the device applies steps, it was told; ticks or more were wrong",
     "long hold": "the device holds a force for ticks, are agreed",
     "tick leap": "the tick number leapt by, the watchdog allows",
-    "device clock": "a tick of the device lasts us by its own clock over ticks, T is us",
+    "device clock": "a tick of the device lasts us by its time stamps over ticks, T is us",
     "host clock": "a tick of the device lasts us by the host's clock over ticks, T is us",
     "armed itself": "the device is armed without a command",
     "disarmed itself": "the device has disarmed itself",
@@ -71,9 +71,8 @@ CAUSES = {
     "deadman": "the deadman was let go for s",
     "time": "the time is over",
     "nobody to arm": "nobody is there to arm the softer coupling",
-    "asked to move": "move axis by mm or more in its + direction, and hold it there",
-    "asked again": "axis moved by mm, not in + direction. Go back, then move axis by mm or more in its + direction, "
-    "and hold it there",
+    "asked to move": "move axis by mm or more and hold it",
+    "asked again": "axis moved by mm, not in + direction. Go back, then move axis by mm or more and hold it",
     "moved backwards": "axis moved by mm, not in + direction, twice: reverse both its motor and its encoder, unless "
     "the person moved it the other way",
     "moved another axis": "axis moved by mm instead of axis, twice: the axes are exchanged, with motors and encoders, "

@@ -94,7 +94,7 @@ class MovesAxes:
         self.axes, self._emulator, self._mm, self._plan, self._requests = [], emulator, mm, [], set()
 
     def __call__(self, session):
-        request = re.search(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
+        request = re.search(r"move axis (\d) by \+5 mm or more", session.request or "")
         if request and session.request not in self._requests:
             self._requests.add(session.request)
             self.axes.append(int(request[1]))

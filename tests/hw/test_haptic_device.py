@@ -53,6 +53,7 @@ class StandIn:
         self.enabled, self.open, self.log, self.watchdogs = {}, [], [], []
         self.broken, self.saturated, self.push = False, False, lambda t: 0.0
         self.steps = {}
+        self.status, self.buttons, self.serials = {}, [1, 1], [4711, 4712]
 
     # the clock
 
@@ -97,7 +98,11 @@ class StandIn:
         return 0
 
     def getStatus(self, out, ID):
+        vars(out).update(self.status)
         return 0
+
+    def getButton(self, index, ID):
+        return self.buttons[ID]
 
     @staticmethod
     def Status():
@@ -107,7 +112,7 @@ class StandIn:
         return "omega.3"
 
     def getSerialNumber(self, ID):
-        return 4711
+        return self.serials[ID]
 
     def getPosition(self, out, ID):
         self.now += self.read / self.channels
@@ -139,14 +144,14 @@ class StandIn:
 SOFT = SpringDamper([400.0, 400.0], [0.2, 0.2])
 
 
-def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None, own=None, spare=0):
+def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None, own=None, spare=0, **settings):
     """Run a session of Live with the stand-in to its end; return it, its recorder and its couplings.
 
     The coupling is `own`, or designed for the measured latency.
     """
-    session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
+    session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150, **settings))
     session.record = recorder = Recorder(2)
-    with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
+    with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep, session.settings.deadman) as device:
         couplings = []
 
         def plan(ages):
@@ -316,6 +321,39 @@ def test_impossible_positions_stop_the_session(scenario, monkeypatch, place):
     assert sdk.force.tolist() == [0.0, 0.0]
 
 
+def test_a_button_of_every_device_is_the_deadman(scenario):
+    sdk, disarmed = StandIn(scenario), set()
+    sdk.buttons = [0, 1]
+
+    def watch(session):
+        if session.stage == Stage.DISARMED:
+            disarmed.add(session.request)
+            sdk.buttons = [1, 1] if session.now > 1_000_000 else [0, 1]
+        if session.stage == Stage.ARMED:
+            sdk.buttons = [1, 0]
+
+    session, *_ = held_session(scenario, sdk, watch=watch, own=SOFT, deadman=True)
+    assert disarmed == {"the deadman at the device is not held"}
+    assert (session.stage, cause_of(session.cause)) == (Stage.STOPPED, "device deadman:")
+    assert len(session.armings) == 1
+
+
+def test_buttons_that_cannot_be_read_are_refused(scenario):
+    sdk = StandIn(scenario)
+    sdk.buttons = [1, -1]
+    with pytest.raises(InputError, match=r"--deadman device: .* device 1 .*; give --deadman key"):
+        ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep, deadman=True)
+    assert sdk.open == []
+
+
+def test_reset_mode_is_named_before_arming(scenario):
+    sdk = StandIn(scenario)
+    sdk.status["reset"] = 1
+    session, *_ = held_session(scenario, sdk, own=SOFT)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "device 0 is in reset mode: calibrate it")
+    assert session.armings == []
+
+
 def test_saturated_motors_are_device_faults(scenario):
     """The force of a saturated motor is not the certified one."""
     sdk = StandIn(scenario)
@@ -414,6 +452,17 @@ def test_exceptions_while_opening_close_every_device(scenario, monkeypatch, call
     assert sdk.enabled == {0: False, 1: False}
 
 
+def test_two_names_of_a_device_are_refused(scenario):
+    sdk = StandIn(scenario)
+    sdk.serials = [4711, 4711]
+    with pytest.raises(InputError, match="0 and 1 are the same device, serial number 4711"):
+        ForceDimension(scenario, "0x,1x", sdk, sdk.clock, sdk.sleep)
+    assert sdk.open == []
+    sdk.serials = [-1, -1]  # these devices report no serial number
+    with ForceDimension(scenario, "0x,1x", sdk, sdk.clock, sdk.sleep):
+        assert sdk.open == [0, 1]
+
+
 def test_one_device_may_serve_two_channels(scenario):
     sdk = StandIn(scenario)
     with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep) as device:
@@ -426,11 +475,13 @@ def test_one_device_may_serve_two_channels(scenario):
 )
 def test_unused_axes_need_a_mechanical_clamp(scenario, monkeypatch, terminal, answer, passes):
     sdk = StandIn(scenario)
-    monkeypatch.setattr(session_cli, "ForceDimension", lambda *args: ForceDimension(*args, sdk, sdk.clock, sdk.sleep))
+    monkeypatch.setattr(
+        session_cli, "ForceDimension", lambda *args, **more: ForceDimension(*args, sdk, sdk.clock, sdk.sleep)
+    )
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: terminal))
     monkeypatch.setattr("builtins.input", lambda question: answer)
     args = bridge._parser().parse_args(["--port", "force-dimension:0x,1x", "--arm"])
-    session = SimpleNamespace(scenario=scenario)
+    session = SimpleNamespace(scenario=scenario, settings=LinkSettings())
     with ExitStack() as stack, nullcontext() if passes else pytest.raises(InputError, match="y and z of device 0"):
         session_cli._device(args, session, stack)
     args.clamped = True

@@ -177,6 +177,11 @@ def test_options_that_exclude_arrival_latching_are_refused(more, said):
         bridge(["--rehearse", "--latch", "arrival", *more])
 
 
+def test_force_dimension_devices_never_latch_at_ticks():
+    with pytest.raises(InputError, match="--latch tick with --port force-dimension: "):
+        bridge(["--port", "force-dimension", "--latch", "tick", "--arm", "--no-dead-man"])
+
+
 @pytest.mark.parametrize("more", [["--condition", "any-environment", "--psi", "1"], ["--energy-budget", "0.01"]])
 def test_refusals_name_the_port_that_was_given(more):
     with pytest.raises(InputError, match=" with --port force-dimension:0x,1x, whose") as refused:

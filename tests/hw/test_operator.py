@@ -1,8 +1,11 @@
 """Check in virtual time who arms a live session, and when."""
 
+import re
+
 import numpy as np
 import pytest
 
+from haptic_loop.cli import session_cli
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.encoders import AxisCheck
@@ -103,6 +106,16 @@ def test_sessions_that_never_armed_have_not_finished(scenario, link_couplings, e
     assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")
 
 
+def test_the_status_line_shows_positions_and_request(scenario, link_couplings, monkeypatch, capfd):
+    """Both fit into 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    settings = LinkSettings(measure=100, check_axes=True)
+    session_cli._show(rehearsal_of(scenario, link_couplings, settings=settings).run(1.5))
+    assert re.search(
+        r"disarmed( · [+-]\d+\.\d{3} mm){2} · move axis 1 by \+5 mm or more and hold it", capfd.readouterr().err
+    )
+
+
 # axes that a person moves before the first arming
 
 
@@ -138,7 +151,7 @@ def test_small_motions_show_no_axis(scenario, link_couplings, monkeypatch):
     assert (session.stage, axes) == (Stage.DISARMED, [1])
     session.arm(session.now)
     assert session.stage == Stage.DISARMED
-    assert cause_of(session.log[-1].cause) == "asked to move: 1 5"
+    assert cause_of(session.log[-1].cause) == "asked to move: 1 +5"
 
 
 def checked(places, lever=1.0, q=1e-5):
@@ -187,7 +200,7 @@ def test_the_way_back_counts_as_no_motion():
     """A reversed axis moves back in its measured + direction."""
     answers, check = checked([(-8,), (0,)])
     assert not answers
-    assert cause_of(check.request) == "asked again: 1 -8 1 5"
+    assert cause_of(check.request) == "asked again: 1 -8 1 +5"
 
 
 def test_a_sagging_handle_passes_no_axis():
