@@ -95,9 +95,9 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--force-cap", type=number(0.05, 12.0), metavar="NEWTON", help=cap)
     speed = "fastest motion of a hand while forces act (default 0.7, at most the devices' least credible_speed)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
-    heat = "force that each motor can hold for ever, or one number for all; larger forces are limited in time by I2t "
-    heat += "(default: not watched)"
-    add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
+    heat = "force at the hand that each motor can hold for ever, or one number for all; larger forces are limited in "
+    heat += "time by I2t (default: not watched)"
+    add("--continuous-force", type=options.several(float, 1e-3, 12.0), metavar="N,N,..", help=heat)
     warm = "time constant of the motors' heating (default 10)"
     add("--thermal-time", type=number(0.1, 1000), default=10.0, metavar="SECONDS", help=warm)
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
@@ -127,7 +127,8 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     """Return the safety limits for `session_for`, and set args.deadman. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
-        more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
+        forces = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
+        more["continuous"] = tuple(scenario.lever * force for force in forces)
     if args.port and not args.deadman and not args.no_dead_man:
         args.deadman = "key"
     if args.deadman and args.no_dead_man:

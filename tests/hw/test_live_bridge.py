@@ -445,7 +445,7 @@ def test_a_pulled_cable_ends_the_session(scenario, link_couplings):
         (["--rehearse", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
         (["--rehearse", "--fault", "nonsense"], "--fault is 'nonsense'"),
         (["--rehearse", "--fault", "late=1.5"], "--fault late=1.5: VALUE is 1.5"),
-        (["--rehearse", "--continuous-force", "-1"], "--continuous-force) is -1 .. 0.001 to 12 N"),
+        (["--rehearse", "--continuous-force", "-1"], "--continuous-force is -1 .. 0.001 to 12"),
         (["--port", "/dev/a,", "--arm", "--no-dead-man"], "--port is '/dev/a,': path 2 of 2 is empty"),
         (["--rehearse", "--fault", "freeze@0.5+1"], "freeze does not end, so it takes no DURATION"),
     ],

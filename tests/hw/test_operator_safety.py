@@ -156,6 +156,8 @@ def test_sessions_have_low_default_limits(scenario):
     args = _parser().parse_args(["--rehearse", "--continuous-force", "5"])  # the motors' rating is above the cap
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.continuous) == ((1.3, 1.3), (5.0, 5.0))
+    wheel = scenario.replace(unit="rad", radius=0.2)  # 5 N at the hand are 1 N m
+    assert session_for(wheel, LinkSettings(), **limits_from(args, wheel)).limits.continuous == (1.0, 1.0)
 
 
 def light_device(damping):
@@ -307,7 +309,7 @@ def test_forces_cut_over_half_a_second_stop_sessions(scenario, link_couplings, b
         (["--force-cap", "13"], "--force-cap is 13 .. 0.05 to 12"),
         (["--max-speed", "0"], "--max-speed is 0 .. 0.001 to 2.5"),
         (["--continuous-force", "1,2,3"], "--continuous-force has 3 entries"),
-        (["--continuous-force", "13"], "continuous #1 (--continuous-force) is 13"),
+        (["--continuous-force", "13"], "--continuous-force is 13"),
         (["--thermal-time", "nan"], "--thermal-time is nan"),
         (["--port", "/nowhere", "--deadman", "key"], "--deadman key needs a terminal"),
     ],
