@@ -20,7 +20,7 @@ from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_con
 from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.forked import Forked
-from haptic_loop.design.gain_search import SOFTEST, STIFFEST
+from haptic_loop.design.gain_search import STIFFEST, softest
 from haptic_loop.design.program import OBJECTIVES, Options
 from haptic_loop.design.result import Design, finite, listed
 from haptic_loop.design.transparency import BAND_HZ
@@ -242,8 +242,9 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # softer springs are not from this search
-        yield "", f"{SOFTEST:g} N/m is the softest spring that the search tries" if searched else None
+        least, soft = softest(assessment.loop), verdicts.soft_end(assessment.loop)
+        searched = 0.999 * least < min(gains["K"]) < soft  # softer springs are not from this search
+        yield "", f"{least:g} N/m is the softest spring that the search tries" if searched else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)

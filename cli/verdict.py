@@ -12,7 +12,7 @@ from haptic_loop.controller.environment import RIGID_WALL
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult, assess
 from haptic_loop.design.coverage import Robustness
-from haptic_loop.design.gain_search import SOFTEST
+from haptic_loop.design.gain_search import softest
 from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.couplings import choose, qualified
@@ -79,14 +79,19 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
 
 
-SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
 _NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness counts as useless
+
+
+def soft_end(loop: Loop) -> float:
+    """Return the stiffness [N/m] below which a spring is at the soft end of the search."""
+    return 1.001 * softest(loop)
 
 
 def _useless(assessment: Assessment) -> str:
     """Name the contacts at which the coupling renders next to nothing, or return ""."""
     contacts, felt = assessment.loop.environment.contacts, assessment.transparency
-    soft = [K < SOFT_END for K in assessment.gains.get("K", ())]
+    end = soft_end(assessment.loop)
+    soft = [end > K for K in assessment.gains.get("K", ())]
     where = ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
     if soft and all(soft):
         where = "all contacts"

@@ -20,14 +20,20 @@ from haptic_loop.design.result import MAKING, Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import UNDECIDED, HeldDevices, Plan
-from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_no_world
+from haptic_loop.sim.scenario import (
+    InputError,
+    Scenario,
+    require_constant_delay,
+    require_no_world,
+    require_scaled_hands,
+)
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least amplitude of an oscillation: the resolution of a desk device's encoders
+_FINEST = 1e-5  # [m] least amplitude of an oscillation at the hand: the resolution of a desk device's encoders
 _PRESS = 3.0  # [N] steady force of a hand; 0 in maps of environments, because a soft environment would yield
 
 
@@ -38,6 +44,7 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.zwidth")
     require_constant_delay(scenario, "sim.zwidth")
+    require_scaled_hands(scenario)
     if scenario.period is not None:
         raise InputError("period: a map simulates constant periods; give T_max alone, up to which certificates hold")
     if args.case == "none":
@@ -57,7 +64,7 @@ def main(argv: list[str]) -> int:
     marks = tuple(args.mark)
     args.grid = args.grid or (60 if of_coupling and not sweep.walls else 24)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
-    plan, out = _plan(args, sweep, of_coupling), options.out_folder(args, "zwidth")
+    plan, out = _plan(args, sweep, of_coupling, scenario.lever), options.out_folder(args, "zwidth")
 
     crowd = HeldDevices.drawn(
         sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans, latency=sweep.loop.latency
@@ -146,13 +153,13 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
         return zwidth.CouplingSweep(devices, scenario.population, loop, own=name_and_own(args.condition)[1])
 
 
-def _plan(args: argparse.Namespace, sweep: zwidth.Sweep, of_coupling: bool) -> Plan:
+def _plan(args: argparse.Namespace, sweep: zwidth.Sweep, of_coupling: bool, lever: float) -> Plan:
     coarsest = max(float(np.max(device.encoder_step)) for device in sweep.devices)
-    threshold = max(2 * coarsest, _FINEST)
+    threshold = max(2 * coarsest, _FINEST / lever)
     shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
-    return Plan(args.points, _PRESS if of_coupling else 0.0, args.duration, threshold)
+    return Plan(args.points, lever * _PRESS * of_coupling, args.duration, threshold, Plan.start / lever)
 
 
 # ---- the map in a few lines on the terminal

@@ -72,9 +72,9 @@ class DeviceBounds(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         for name, low, high, unit in (
-            ("motor_mass_min", 1e-6, 1e3, "kg"),
-            ("transmission_stiffness_max", 1.0, 1e9, "N/m"),
-            ("transmission_damping_min", 1e-6, 1e5, "N s/m (a lossless transmission guarantees nothing)"),
+            ("motor_mass_min", 1e-9, 1e3, "kg"),
+            ("transmission_stiffness_max", 1e-4, 1e9, "N/m"),
+            ("transmission_damping_min", 1e-9, 1e5, "N s/m (a lossless transmission guarantees nothing)"),
             ("transmission_damping_max", self.transmission_damping_min, 1e5, "N s/m"),
         ):
             if not low <= getattr(self, name) <= high:

@@ -27,6 +27,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.forked import Forked
+from haptic_loop.design.gain_search import softest
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.necessary import LeftOver, left_over
 from haptic_loop.design.result import CAVEATS, GUARD, Requirement, listed, refusal, suffices
@@ -75,7 +76,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 
 #: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device's values.
 _STIFFEST, _LONGEST_PERIOD, _MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
-_SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
+_STEP = 3.0  # ratio between successive values of a search
 _EDGE = 1e-7  # relative accuracy of the edge between certified and uncertified values
 _SMOOTH = 0.1  # A secant estimates the edge only if log(ratio) just outside is below this; else ratio may jump there.
 
@@ -124,9 +125,9 @@ def _stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest
     scale = _STIFFEST / K.max()
     if suffices(ratio(scale)):
         return _Stiffest(unknown, f"certified at the stiffest K tried, {_STIFFEST:g} N/m")
-    largest = _largest(ratio, scale, _SOFTEST / K.max())
+    largest = _largest(ratio, scale, softest(loop) / K.max())
     if largest is None:
-        return _Stiffest(unknown, f"with this B, no multiple of K tried, down to {_SOFTEST:g} N/m, is certified")
+        return _Stiffest(unknown, f"with this B, no multiple of K tried, down to {softest(loop):g} N/m, is certified")
     return _Stiffest(tuple((largest * K).tolist()))
 
 
@@ -149,11 +150,11 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
             return condition.judge(alone, SpringDamper([K], [B])).ratio
 
         bound = 2 * (delta - B) / loop.T
-        softest = 1e-9 * bound
-        largest = edge(ratio, softest, bound) if suffices(ratio(softest)) else _largest(ratio, bound, _SOFTEST)
+        faint = 1e-9 * bound
+        largest = edge(ratio, faint, bound) if suffices(ratio(faint)) else _largest(ratio, bound, softest(loop))
         stiffest.append(largest)
         if largest is None:
-            reasons.append(f"with B = {B:g} N s/m, no K tried, down to {_SOFTEST:g} N/m, is certified")
+            reasons.append(f"with B = {B:g} N s/m, no K tried, down to {softest(loop):g} N/m, is certified")
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 

@@ -33,12 +33,17 @@ from haptic_loop.design.transparency import BAND_HZ, in_band, rms_mismatch
 
 #: unused share of the damping at sampled frequencies, because the gains may need more damping between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
-SOFTEST, STIFFEST = 1.0, 1e6  # [N/m] bounds of K in the search
+STIFFEST = 1e6  # [N/m] largest K in the search
 _CLOSEST_POLE = 1e-5  # least distance of the loop's poles from the unit circle
 _STUCK = 1e-3  # A search whose result violates the condition by more than this is given up.
 FEW = 12  # Up to this number of channels a step of the search is cheap, so that all starts are tried.
 _ROUGH = 0.01  # A start whose gains violate the condition by more than this is tried last.
 _DIFFERENCE = 1e-7  # step of finite differences in x
+
+
+def softest(loop: Loop) -> float:
+    """Return the least K in the search: 1 N/m, or for rotary devices the share 1e-4 of 2 delta/T [N m/rad]."""
+    return 1.0 if loop.unit == "m" else 2e-4 * min(loop.delta) / loop.T
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
@@ -260,7 +265,8 @@ class SampledLoop:
     def search(self, x: Array, most: int) -> Array:
         """Return x after at most `most` steps of SLSQP towards a local optimum."""
         m = self.loop.channels
-        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
+        springs = np.log(softest(self.loop)), np.log(STIFFEST)
+        bounds = [springs] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
         return _slsqp(self.square_mismatch, self.square_mismatch_slope, self.room, self.room_slope, x, bounds, most)
 
 

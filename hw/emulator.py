@@ -70,7 +70,7 @@ _DEVICE = {
     "cross": ("share of motor 1's force that motor 2 adds to its own force", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
-#: faults of one axis of the device: kind -> (meaning, minimum, maximum and default of VALUE)
+#: faults of one axis of the device: kind -> (meaning, minimum, maximum and default of VALUE, at the hand if rotary)
 _AXIS = {
     "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
     "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
@@ -256,7 +256,7 @@ def info_of(scenario: Scenario) -> Info:
     """Return the INFO of an emulated device: the scenario's damping, limits and steps, in the units of the wire."""
     r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
     encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
-    step = _FORCE_STEP if scenario.unit == "m" else max(1, round(1e6 * max(limits) / 30000))
+    step = _FORCE_STEP if scenario.unit == "m" else max(1, math.ceil(1e6 * max(limits) / 30000))
     return Info(
         version=PROTOCOL,
         firmware="emulator",
@@ -290,7 +290,7 @@ class Emulator:
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick as a multiple of T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
-        self._swapped, self._exchanged, self._crossed = False, False, 0.0
+        self._swapped, self._exchanged, self._crossed, self._lever = False, False, 0.0, scenario.lever
         # start of the tick [us], the remaining share of the tick, and whether the whole tick remains
         self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
@@ -367,7 +367,7 @@ class Emulator:
             self.plant.advance(-self.applied)
 
     def _in_counts(self, fault: FaultInjection) -> int:
-        return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
+        return round(1e-3 * fault.value / self._lever / (1e-12 * self.info.encoder_step[fault.axis]))
 
     def _also(self, fault: FaultInjection, earlier: Callable[[int], int]) -> Callable[[int], int]:
         """Return how an encoder with `earlier` faults changes a count if it also breaks in the present tick."""
@@ -384,15 +384,16 @@ class Emulator:
     def _broken(self, fault: FaultInjection, now: int) -> Callable[[Any], Any]:
         """Return how a motor or an encoder that breaks at the count `now` changes a force [N] or a count."""
         step, value, most = self.info.encoder_step[fault.axis], fault.value, self._in_counts(fault)
+        newtons = self._lever * value
         match fault.kind:
             case "motor":
                 return lambda force: value * force
             case "oneway":
                 return lambda force: force if force > 0 else value * force
             case "limit":
-                return lambda force: max(-value, min(value, force))
+                return lambda force: max(-newtons, min(newtons, force))
             case "zone":
-                return lambda force: force - max(-value, min(value, force))
+                return lambda force: force - max(-newtons, min(newtons, force))
             case "freeze":
                 return lambda n: now
             case "toggle":
@@ -423,7 +424,7 @@ class Emulator:
                 draw = np.random.default_rng(fault.axis)
                 return lambda n: round(n + draw.normal(0.0, value))
             case "drift":
-                each, begun = value * 1e-9 * self.info.period_ns, self.device.k
+                each, begun = value / self._lever * 1e-9 * self.info.period_ns, self.device.k
                 return lambda n: n + round(each / (1e-12 * step) * distance(self.device.k, begun))
         return lambda n: n + most * (self.device.k % 2)
 
@@ -456,7 +457,8 @@ class Emulator:
                 case "leap":
                     self.device.k = (self.device.k + round(fault.value)) & 0xFFFF
                 case "own":
-                    self.device = _wilful(self.device, fault.axis, round(fault.value / self.force_step[fault.axis]))
+                    steps = round(self._lever * fault.value / self.force_step[fault.axis])
+                    self.device = _wilful(self.device, fault.axis, steps)
                 case "stuck":
                     self.device.halt = lambda cause: None
                 case "period":

@@ -153,14 +153,14 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     def __post_init__(self) -> None:
         _check_common(self, ("motor_mass", "handle_mass"))
-        require("transmission_stiffness", self.transmission_stiffness, 1.0, 1e9, "N/m")
+        require("transmission_stiffness", self.transmission_stiffness, 1e-4, 1e9, "N/m")
         require("transmission_damping", self.transmission_damping, 0.0, 1e5, "N s/m")
         if self.credible_force is not None:
             require("credible_force", self.credible_force, 1e-3, 1e6, "N")
         if known := self.guaranteed:
             require("motor_mass", self.motor_mass, known.motor_mass_min, 1e3, "kg (guaranteed)")
             stiffest = known.transmission_stiffness_max
-            require("transmission_stiffness", self.transmission_stiffness, 1.0, stiffest, "N/m (guaranteed)")
+            require("transmission_stiffness", self.transmission_stiffness, 1e-4, stiffest, "N/m (guaranteed)")
             least, most = known.transmission_damping_min, known.transmission_damping_max
             require("transmission_damping", self.transmission_damping, least, most, "N s/m (guaranteed)")
 
@@ -223,7 +223,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     for name in masses:
-        require(name, getattr(device, name), 1e-6, 1e3, "kg")
+        require(name, getattr(device, name), 1e-9, 1e3, "kg")
     _check_axes(device)
     limits = (("force_limit", 1e-3, 1e6, "N"), ("encoder_step", 0.0, 1e-2, "m"), ("friction", 0.0, 1e3, "N"))
     for name, low, high, unit in limits:

@@ -330,7 +330,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         along = (1.0,) if self.along is msgspec.UNSET else self.along
         if not (any(abs(c) > 1e-9 for c in along) and all(abs(c) < 1e9 for c in along)):
             raise ValueError(f"along is {list(along)}, expected sizes below 1e9, at least one above 1e-9")
-        require("amplitude", self.amplitude, 0.0, 1.0, "m")
+        require("amplitude", self.amplitude, 0.0, 100.0, "m")  # knobs turn often; a linear Scenario allows up to 1 m
         require("frequency", self.frequency, 0.0, 100.0, "Hz")
         require("phase", self.phase, -100.0, 100.0, "rad")
         require("ease", self.ease, 0.0, 1e4, "s")

@@ -31,7 +31,7 @@ from haptic_loop.sim.stability import ClosedLoop, dominant_mode, exact_loops
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-_MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # ranges of the searched masses [kg] and stiffnesses [N/m]
+_MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # ranges of searched masses [kg] and stiffnesses [N/m] at the hand
 _WITHIN = 4  # number of parameters that place a device within its guaranteed bounds (models.device.Mechanics)
 _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
@@ -89,9 +89,10 @@ def search(
         progress(done, len(passes) * generations)
         return first and bool(-intermediate_result.fun > 10 * _DESTABILISED)
 
-    best, evaluated = None, 0
+    best, evaluated, scale = None, 0, scenario.lever**2
+    mass, stiffness = ([scale * end for end in ends] for ends in (_MASS, _STIFFNESS))
     for trial, kind in enumerate(passes):
-        logarithms = [_MASS, _STIFFNESS] * (m * kind.links) + [_MASS, _STIFFNESS, _STIFFNESS] * kind.held
+        logarithms = [mass, stiffness] * (m * kind.links) + [mass, stiffness, stiffness] * kind.held
         known = all(device.guaranteed for device in scenario.device)
         ranges = [*np.log(logarithms), *[(-1.0, 1.0)] * (_WITHIN * m * known)]
         optimum = differential_evolution(

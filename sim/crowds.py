@@ -38,7 +38,7 @@ from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_me
 from haptic_loop.sim.accuracy import simulated_growth
 from haptic_loop.sim.engines import EXPONENTIAL, Engine, ExactEngine, MujocoBatchEngine, OneByOne, least_substeps
 from haptic_loop.sim.run import Progress, Simulation, assemble, make_engine
-from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.scenario import Scenario, require_scaled_hands
 from haptic_loop.sim.stability import (
     Balance,
     ClosedLoop,
@@ -92,6 +92,9 @@ class Validation:
     environments: tuple[Member, ...] = ()  # environments that the sets touch in turn; (): all touch the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
+
+    def __post_init__(self) -> None:
+        require_scaled_hands(self.scenario)
 
     @property
     def ticks(self) -> int:
@@ -370,13 +373,14 @@ def _traced(
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks
     balance = Balance.of(held_by, simulation.loop, late)
-    exact = impulse_test(process, ExactEngine(plants), held_by.scene, loops, balance, ticks)
+    lever = validation.scenario.lever
+    exact = impulse_test(process, ExactEngine(plants), held_by.scene, loops, balance, ticks, lever)
     if not other:
         return exact
     timing = Timing(np.array([T]), np.array([late])) if late else None
     few = held_by.taken(witnesses)
     own = ClosedLoop(loops.A[witnesses], loops.B[witnesses], T)
-    settings = few.scene, own, Balance.of(few, simulation.loop, late), ticks
+    settings = few.scene, own, Balance.of(few, simulation.loop, late), ticks, lever
     last = impulse_test(process, other(witnesses, EXPONENTIAL, timing), *settings, ticked)
     growth, error, clipped = (getattr(exact, name).copy() for name in ("growth", "error", "clipped"))
     growth[witnesses], error[witnesses], clipped[witnesses] = last.growth, last.error, last.clipped

@@ -134,14 +134,13 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo. The human with whom the exact linear loop grows fastest holds the devices. Only modes that a trace
 # can show count: they oscillate fast enough, or run away. The plant starts in this mode, scaled so that the motor or
-# handle that moves most is displaced by _START; so does a process without walls and limiter. Each hand presses with a
-# force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
+# handle that moves most is displaced by `Plan.start`; so does a process without walls and limiter. Each hand presses
+# with a force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest allowed force limit of a device, which no force here reaches
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] time in which the hand's force grows to its constant value
-_START = 1e-3  # [m] initial displacement of the motor or handle that moves most
 _BLOCK = 64  # ticks between two calls of `progress`
 _DECIDED = 0.2  # [1/s] A trace is too short to show the sign of a smaller growth rate.
 UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear loop's rate is at most _DECIDED
@@ -160,11 +159,12 @@ class Plan:
     press: float  # [N] steady force of every hand
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a motor or handle oscillates
+    start: float = 1e-3  # [m] initial displacement of the motor or handle that moves most
 
     @property
     def runaway_growth(self) -> float:
         """The growth [1/s] above which a mode has diverged by the end of the trace."""
-        return 1.2 * np.log(RUNAWAY / _START) / self.duration
+        return 1.2 * np.log(RUNAWAY / self.start) / self.duration
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan)
         shown = np.where(runs_away, fastest, swinging)
         human = int(np.argmax(shown))
         mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
-        trials.append(_Trial(process, held.links(human), _START * mode))
+        trials.append(_Trial(process, held.links(human), plan.start * mode))
         growth.append(shown[human])
     return trials, np.array(growth)
 

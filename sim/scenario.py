@@ -62,9 +62,12 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("duration", self.duration, 0.0, 1e6, "s")
 
 
-def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i (from 0): 0.3 kg on a spring whose far end moves by +-15 mm at 0.6 Hz."""
-    return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
+def _usual_hand(i: int, r: float) -> Human:
+    """Return the default hand of device i (from 0): 0.3 kg on a spring whose far end moves by +-15 mm at 0.6 Hz.
+
+    For a rotary device, the hand holds it at the radius r [m]; otherwise r is 1.
+    """
+    return Human((Link(0.3 * r**2, 3.0 * r**2, 200.0 * r**2),), Voluntary(0.015 / r, 0.6, phase=0.5 * np.pi * i))
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -76,7 +79,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     name: str
     unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with forces in N m and dampings in N m s/rad
-    radius: float | None = None  # [m] from a rotary device's axis to the hand; sessions limit the force at the hand
+    radius: float | None = None  # [m] from a rotary device's axis to the hand; scales default hands and limits
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples], the paper's equation 4
     psi: _Delays = _UNSAID  # environment delays [samples], equation 5; default: 0
@@ -112,7 +115,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.psi is _UNSAID:
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
         if self.human is _UNSAID:
-            msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(len(self.device)))))
+            if self.unit == "rad" and self.radius is None:
+                where = "the distance in metres from axis to hand, which scales the default hands"
+                raise ValueError(f"radius is missing: give {where}; or give [[human]]")
+            usual = tuple(_usual_hand(i, self.lever) for i in range(len(self.device)))
+            msgspec.structs.force_setattr(self, "human", usual)
         self._check_counts()
         for name in ("theta", "psi", "lam"):
             value = getattr(self, name)
@@ -130,6 +137,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         check_holds([person.holds for person in self.person], len(self.device))
         for i, (human, device) in enumerate(zip(self.human, self.device, strict=True), start=1):
             has = len(device.free)
+            if isinstance(human, Human) and human.voluntary and self.unit == "m":
+                require(f"human #{i}.voluntary.amplitude", human.voluntary.amplitude, 0.0, 1.0, "m")
             for field, value in human.vectors() if isinstance(human, Human) else ():
                 if len(value) != has:
                     expected = f"expected {has} entries, one for each free axis of the device"
@@ -494,6 +503,13 @@ def require_no_world(scenario: Scenario, what: str) -> None:
         )
 
 
+def require_scaled_hands(scenario: Scenario) -> None:
+    """Raise InputError if nothing says how large random hands are at a rotary device."""
+    if scenario.unit == "rad" and scenario.radius is None and scenario.population == Population():
+        where = "the distance in metres from axis to hand, which scales random hands"
+        raise InputError(f"radius is missing: give {where}; or give [population]")
+
+
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
     """Raise InputError if a loop has Coulomb friction, or has walls although `walls` is False."""
     for i, device in enumerate(scenario.device, start=1):
@@ -653,6 +669,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     try:
         if kind is Scenario:
             _require_keys(raw)
+            raw = _at_the_hand(raw)
         return msgspec.convert(_with_world(_in_space(_with_catalogue(raw)), folder), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
@@ -678,6 +695,15 @@ def _require_keys(raw: dict[str, Any]) -> None:
             raise ValueError(
                 f"device #{i}: missing {', '.join(missing)}: rotary devices have neither defaults nor a catalogue"
             )
+
+
+def _at_the_hand(raw: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of a rotary scenario with the default ranges of its population at the radius."""
+    r, people = raw.get("radius"), raw.get("population", {})
+    if raw.get("unit") != "rad" or not isinstance(r, int | float) or not 0 < r <= 1 or not isinstance(people, dict):
+        return raw  # A linear scenario, or one without a valid radius.
+    units = {name: np.array(getattr(Population(), name)) * r**2 for name in ("mass", "damping", "stiffness")}
+    return raw | {"population": {name: each.tolist() for name, each in units.items()} | people}
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:

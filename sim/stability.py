@@ -494,16 +494,17 @@ def impulse_test(
     loops: ClosedLoop,
     balance: Balance,
     ticks: int,
+    lever: float,
     tick_done: Callable[[int], None] = lambda ticks: None,
 ) -> ImpulseTest:
     """Simulate `ticks` periods with every set of humans after an impulse, and return the sums of the traces.
 
-    `loops` are the exact closed loops. With walls the impulse is larger, so that hands reach the walls, and growth is
-    not measured.
+    `loops` are the exact closed loops; the impulse is proportional to the `lever` of the scenario. With walls it is
+    larger, so that hands reach the walls, and growth is not measured.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, balance, ticks)
-    push = partial(impulse_forces, scene, loops.T, size=_TO_THE_WALL if process.walls else 1.0)
+    push = partial(impulse_forces, scene, loops.T, size=lever * (_TO_THE_WALL if process.walls else 1.0))
 
     def each_block(buffer: StepBuffer, first: int, count: int) -> None:
         audit.see(buffer, first, count)

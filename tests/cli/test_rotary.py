@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from messages import says
 
-from haptic_loop import certify, design_coupling, simulate
+from haptic_loop import certify, design_coupling, simulate, validate
 from haptic_loop.controller.units import in_unit, keys_in_unit, set_unit
+from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.session import session_for
 from haptic_loop.sim.couplings import read_coupling
@@ -116,7 +117,7 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
             "device #1: missing motor_mass, handle_mass, transmission_stiffness",
         ),
         (('kind = "rigid"', 'device = "omega.3"'), "neither defaults nor a catalogue"),
-        (("mass = 0.02\ndamping = 0.1", "mass = 1e9\ndamping = 0.1"), "mass is 1e+09 .. 1e-06 to 1000 kg m2"),
+        (("mass = 0.02\ndamping = 0.1", "mass = 1e9\ndamping = 0.1"), "mass is 1e+09 .. 1e-09 to 1000 kg m2"),
     ],
 )
 def test_wrong_rotary_fields_are_named(change, words):
@@ -153,3 +154,68 @@ def test_sessions_ask_for_the_radius():
     assert limits.jump == pytest.approx(0.02)
     with pytest.raises(InputError, match="radius is missing"):
         session_for(parse(WHEEL.read_text().replace("radius = 0.15", "")), LinkSettings())
+
+
+KNOB = """
+name = "knob"
+unit = "rad"
+radius = 0.02
+T = 1e-3
+theta = [1]
+device = [{ kind = "rigid", mass = 2e-5, damping = 2e-4, force_limit = 0.1, credible_speed = 30.0 }]
+[environment]
+contacts = ["rim"]
+springs = [{ between = ["rim", "ground"], stiffness = 0.05, damping = 1e-4 }]
+"""
+
+
+def test_default_hands_hold_the_radius():
+    """At the hand, a knob has the default hands of a handle: 0.3 kg, 3 N s/m, 200 N/m, 15 mm; 0.01 to 3 kg."""
+    knob = parse(KNOB)
+    link, motion, people = knob.human[0].links[0], knob.human[0].voluntary, knob.population
+    assert (link.mass, link.damping, link.stiffness) == pytest.approx((1.2e-4, 1.2e-3, 0.08))
+    assert (motion.amplitude, motion.frequency) == pytest.approx((0.75, 0.6))
+    ranges = np.array([people.mass, people.damping, people.stiffness])
+    assert ranges == pytest.approx(4e-4 * np.array([(0.01, 3.0), (0.1, 30.0), (1.0, 2000.0)]))
+    some = parse(KNOB + "[population]\nlinks = 2\nmass = [1e-5, 1e-4]").population
+    assert (some.links, some.mass) == (2, (1e-5, 1e-4))
+    assert some.damping == people.damping
+
+
+def test_hands_without_size_ask_for_the_radius():
+    alone = KNOB.replace("radius = 0.02", "")
+    with pytest.raises(InputError, match=r"radius is missing.*\[\[human\]\]"):
+        parse(alone)
+    held = parse(alone + "[[human]]\nlinks = [{ mass = 1e-4, damping = 1e-3, stiffness = 0.1 }]")
+    with pytest.raises(InputError, match=r"radius is missing.*\[population\]"):
+        validate(held, None, humans=2)
+
+
+def test_faults_of_a_knob_are_at_the_hand():
+    """At 20 mm, 5 mm are 0.25 rad, and 0.6 N are 12 mN m."""
+    jumps, limit = Emulator(parse(KNOB), (FaultInjection.parse("jump=5"),)), FaultInjection.parse("limit=0.6")
+    assert jumps._in_counts(FaultInjection.parse("jump=5")) * 1e-12 * jumps.info.encoder_step[0] == pytest.approx(0.25)
+    assert jumps._broken(limit, 0)(1.0) == pytest.approx(0.012)
+
+
+@pytest.mark.parametrize("cap", [None, 5.0])
+def test_a_healthy_knob_finishes_its_rehearsal(cap, tmp_path):
+    """The default cap of 0.5 N holds 0.01 N m, 5 N are the knob's own limit of 0.1 N m."""
+    path = tmp_path / "knob.toml"
+    path.write_text(KNOB)
+    words = ["--scenario", str(path), "--rehearse", "--duration", "0.5", "--measure", "60", "--no-plot"]
+    words += ["--out", str(tmp_path / "out"), *(["--force-cap", str(cap)] if cap else [])]
+    assert import_module("haptic_loop.cli.bridge").main(words) == 0
+
+
+def test_soft_springs_are_stiff_for_knobs(tmp_path, capsys):
+    """Two knobs of 2e-4 N m s/rad need K below 1 N m/rad, and half a spring of 0.05 N m/rad is not useless."""
+    path = tmp_path / "knobs.toml"
+    device = re.search(r"device = \[(.*)\]", KNOB)[1]
+    text = KNOB.replace(device, f"{device}, {device}").replace("[1]", "[1, 1]").replace('"rim"]', '"rim", "rim2"]', 1)
+    path.write_text(text.replace('["rim", "ground"]', '["rim", "rim2"]'))
+    design = design_coupling(load(path).loop("I"))
+    assert 0.1 < max(design.coupling.K) < 1.0
+    path.write_text(KNOB)
+    assert import_module("haptic_loop.cli.audit").main(["--scenario", str(path), "--K", "0.05", "--B", "1e-4"]) == 0
+    assert "Useless" not in capsys.readouterr().out

@@ -208,7 +208,7 @@ def test_voluntary_velocity_is_the_motions_derivative():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: CompliantDevice(motor_mass=-1.0), "motor_mass is -1.*1e-06 to 1000 kg"),
+        (lambda: CompliantDevice(motor_mass=-1.0), "motor_mass is -1.*1e-09 to 1000 kg"),
         (lambda: RigidDevice(mass=float("nan")), "mass is nan"),
         (lambda: RigidDevice(delta=2.0), r"delta is 2 N s/m.*values in \(0, damping = 1.37\]"),
         (lambda: Link(0.1, -1.0, 1.0), "damping is -1"),

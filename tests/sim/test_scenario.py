@@ -32,7 +32,7 @@ BAD = [
     ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
     ("T = 1.2e-3", "T == 1", "not valid TOML"),
     ("name = ", "nam = ", "`nam` .. `name`"),
-    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06 .. 1e-06 to 1000 kg"),
+    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06 .. 1e-09 to 1000 kg"),
     ("motor_mass = 0.06 ", "motor_mas = 0.06", "`motor_mas` .. `motor_mass`"),
     ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m .. values in (0, damping = 1.37]"),
     ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft' .. 'compliant'"),
