@@ -50,9 +50,8 @@ def main(argv: list[str]) -> int:
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    # In a rehearsal the scenario's hands hold the handles, and no person can move the axes for a check.
-    checked = not (args.rehearse or args.no_axis_check)
-    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse, check_axes=checked)
+    # In a rehearsal the scenario's hands hold the handles.
+    settings = replace(session_cli.with_person(args, settings), held=args.rehearse)
     session = session_for(scenario, settings, **limits)
     below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
     scenario = session.scenario
@@ -141,6 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_loop()
     session_cli.add_link_options(parser)
     session_cli.add_safety_options(parser)
+    session_cli.add_person_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument(
         "--coupling",

@@ -17,10 +17,12 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import (
     add_link_options,
     add_output_options,
+    add_person_options,
     boards_behind,
     check_link,
     hold_session,
     steady_scenario,
+    with_person,
 )
 from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import off_table, plain, write
@@ -63,6 +65,11 @@ class _Sitting:
     trace: Path | None = off_table("left out")
     signals: Sequence[int] = off_table("left out")
 
+    @property
+    def finished(self) -> bool:
+        """Whether the session ended as planned; otherwise the device is not driven again."""
+        return self.session.stage == Stage.FINISHED and not self.signals
+
 
 @dataclass(frozen=True, eq=False)
 class _Report:
@@ -100,16 +107,16 @@ def main(argv: list[str]) -> int:
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
+    settings = replace(with_person(args, settings), identifies=True, held=False)
     out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
-    settings = replace(settings, test_encoders=False)
-    while len(sittings) < args.sittings and not (sittings and sittings[-1].signals):
+    while len(sittings) < args.sittings and (not sittings or sittings[-1].finished):
         sittings.append(_sitting(args, scenario, settings, out, len(sittings) + 1))
-        last = sittings[-1].session.link.last
+        settings, last = replace(settings, check_axes=False), sittings[-1].session.link.last
         if args.port and last:
             settings = replace(settings, elsewhere=last.counts)
     report, clamped = _identified(scenario, sittings), list[_Sitting]()
-    if args.transmission and report.bounded and not sittings[-1].signals:
-        settings = replace(settings, elsewhere=None)
+    if args.transmission and report.bounded and sittings[-1].finished:
+        settings = replace(settings, elsewhere=None, test_encoders=False)  # no test moves a clamped handle
         for level in _LEVELS:
             clamped.append(_sitting(args, scenario, settings, out, args.sittings + len(clamped) + 1, level))
         report = _with_transmissions(report, scenario, sittings, clamped)
@@ -136,7 +143,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_loop()
     add_link_options(parser)
-    parser.set_defaults(deadman=None, no_preflight=True)
+    add_person_options(parser)
+    parser.set_defaults(no_preflight=True)
     add, number = parser.add_argument, options.number
     add("--force", type=number(0.05, 6.0), default=1.0, metavar="NEWTON", help="amplitude of the chirp (default 1)")
     band = "frequencies of the chirp [Hz] (default 3,200)"

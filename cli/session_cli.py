@@ -12,7 +12,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ def add_output_options(parser: options.Parser, picture: bool = False) -> None:
 
 
 def add_safety_options(parser: options.Parser) -> None:
-    """Add the options that limit forces and motions, and the dead-man switch."""
+    """Add the options that limit forces and motions."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force of a device at the hand (default 1.3, or less so that no constant force moves a free handle "
     cap += "faster than 1 m/s)"
@@ -102,16 +102,22 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--thermal-time", type=number(0.1, 1000), default=10.0, metavar="SECONDS", help=warm)
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     add("--no-rereference", action="store_true", help=absolute)
+    add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
+    parser.only("with --port", lambda args: args.port, "no_preflight")
+    parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
+
+
+def add_person_options(parser: options.Parser) -> None:
+    """Add the options for what a person at the device must do: hold a dead-man switch, and move every axis."""
+    add = parser.add_argument_group("the person at the device").add_argument
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
     add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
     unchecked = "arm without asking the user to move every axis in its + direction by hand"
     add("--no-axis-check", action="store_true", help=unchecked)
-    add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
-    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man", "no_axis_check")
+    parser.only("with --port", lambda args: args.port, "no_dead_man", "no_axis_check")
     held = "with --port: in a rehearsal only --deadman device acts"
     parser.only(held, lambda args: args.port or args.deadman == "device", "deadman")
-    parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
@@ -124,18 +130,27 @@ def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """Return the safety limits for `session_for`, and set args.deadman. Raises InputError."""
+    """Return the safety limits for `session_for`. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         forces = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
         more["continuous"] = tuple(scenario.lever * force for force in forces)
+    return more
+
+
+def with_person(args: argparse.Namespace, settings: LinkSettings) -> LinkSettings:
+    """Return the settings with the checks of `add_person_options`, and set args.deadman. Raises InputError.
+
+    In a rehearsal nobody can move the axes for a check.
+    """
     if args.port and not args.deadman and not args.no_dead_man:
         args.deadman = "key"
     if args.deadman and args.no_dead_man:
         raise InputError("--no-dead-man contradicts --deadman: give one of them")
     if args.deadman == "key" and not sys.stdin.isatty():
         raise InputError("--deadman key needs a terminal: give --deadman FILE, --deadman device or --no-dead-man")
-    return more
+    checked = not (args.rehearse or args.no_axis_check)
+    return replace(settings, deadman=args.deadman == "device", check_axes=checked)
 
 
 def _speed(args: argparse.Namespace, scenario: Scenario) -> float:

@@ -296,7 +296,8 @@ class Drive:
         self._rereference = settings.rereference
         first = EncoderTest(axes, expected, config.theta == 0)
         last = EncoderTest(axes, expected, config.theta == 0, first.sizes)
-        self._test, self._last_test = (first, last) if settings.test_encoders else (None, None)
+        self._test = first if settings.test_encoders else None
+        self._last_test = last if settings.test_encoders and not settings.identifies else None
         self.remarks = first.remarks  # what the test at arming could not judge
         self.encoders = EncoderMonitor(axes)
         self._heat = Heat(limits, T)
@@ -308,7 +309,8 @@ class Drive:
         noise = np.multiply(still, units.encoder_step).tolist()
         #: (m,) mass [kg], mode of the transmission [rad/s], noise of a position [m], and whether samples may repeat
         self._axes = [*zip(expected.mass, expected.mode, noise, (behind > 0 for behind in late), strict=True)]
-        self._weighs = settings.test_encoders  # The mass of a device that is being identified is unknown.
+        self._identifies = settings.identifies
+        self._weighs = settings.test_encoders and not settings.identifies  # whether the mass is known
         self._clock_us = 0  # the device's clock at the last STATE
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming = counters, record, arming
@@ -345,9 +347,9 @@ class Drive:
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
         for k, between in enumerate(positions[:-1], start=1 - ticks):  # ticks without a STATE
-            tick, wanted = (state.tick + k) & 0xFFFF, self.controller.step(between)
+            tick, wanted = (state.tick + k) & 0xFFFF, self._wanted(between)
             self._record(TraceRow(tick, between, wanted, self.gain, (), None, self._arming.number))
-        wanted = self.controller.step(x)
+        wanted = self._wanted(x)
         test = None
         if direction > 0:
             test = self._test.force(state, ticks) if self._test else None
@@ -373,6 +375,10 @@ class Drive:
             self._commands.tell(state.tick, sent)
         self._record(TraceRow(state.tick, x, wanted, self.gain, sent, state, self._arming.number, test, limited))
         return sent
+
+    def _wanted(self, x: Sequence[float]) -> Sequence[float]:
+        """Return the controller's force (m,) [N]. A force that identifies a device begins after the test."""
+        return (0.0,) * len(x) if self._identifies and self._test else self.controller.step(x)
 
     def _within_energy(
         self,

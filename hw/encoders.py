@@ -25,6 +25,7 @@ _TEST_SPEED = 0.1  # [m/s] speed in the last test, whose force may exceed _TEST_
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio of a motion to the expected motion, or of the expected motion to it
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 2e-5 of a motion at 2 Hz
+_ROUGH = 12  # largest degree of polynomials that contain a motion at the force's 17 Hz, but none above 45 Hz
 #: A motion has the expected shape if a multiple of that shape makes up this share of its sum of squares. The share is
 #: 0.93 for loosely held handles, and at most 0.5 for compliant devices whose handle is held firmly.
 _FIT = 0.8
@@ -41,6 +42,9 @@ _CLEAN, _RUBBED = 0.15, 0.25  # a dead zone is judged up to this one-sided share
 _STICKS, _SLID = 2.0, 0.3
 #: a one-sided fault must explain this multiple of the squares that remain unexplained; friction and weight reach 6
 _BETTER = 8.0
+#: largest span of the positions in a block of an identification, as a multiple of the expected span; at most 1.4 for
+#: devices as declared, and 2.8 for half the mass
+_DRIFT = 3.0
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as moved to another place
@@ -150,11 +154,14 @@ class Expected:
     For free handles, also predict their motion in hands that weigh as much as the devices.
     """
 
-    def __init__(self, scenario: Scenario, held: bool) -> None:
-        """Build the plants. If `held`, the hands of the scenario hold the handles; otherwise nobody does."""
+    def __init__(self, scenario: Scenario, held: bool, rough: bool = False) -> None:
+        """Build the plants. If `held`, the hands of the scenario hold the handles; otherwise nobody does.
+
+        In an identification the scenario's masses and transmissions are `rough` values.
+        """
         import scipy
 
-        self.held, devices = held, scenario.device
+        self.held, self.rough, devices = held, rough, scenario.device
         bodies = [device.bodies.values() for device in scenario.axis_devices]
         self.mass = [sum(own) for own in bodies]  # (m,) [kg]
         stiffness = [(device.transmission or (0.0, math.inf))[1] for device in scenario.axis_devices]
@@ -221,13 +228,19 @@ class CheckedAxes(NamedTuple):
 class _Block:
     """The motions (m,) in one block of a test, compared with the expected motion of the tested axis."""
 
-    def __init__(self, rows: Array, axis: int, axes: CheckedAxes, mass: float) -> None:
-        """Take the rows of EncoderTest, and the `mass` [kg] of the tested axis."""
+    def __init__(self, rows: Array, axis: int, axes: CheckedAxes, mass: float, rough: bool = False) -> None:
+        """Take the rows of EncoderTest, and the `mass` [kg] of the tested axis.
+
+        If its transmission is a `rough` value, only motions near the frequency of the force count, because a mode at
+        45 Hz or more changes them little. Then no fit shows a delay, friction or a fault of the axis.
+        """
         t, expected, loaded, even, *counts = rows.T
         q, ranges = np.array(axes.units.encoder_step), np.array(axes.still)
         self.span, self.reach = np.ptp(counts, axis=1), np.ptp(expected)  # [counts], [m]
-        smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
-        self._fast = lambda signal: signal - smooth @ (smooth.T @ signal)
+        whole = np.linalg.qr(np.vander((t - t.mean()) / len(t), _ROUGH + 1, increasing=True))[0]
+        smooth, band = whole[:, : _DEGREE + 1], whole[:, _DEGREE + 1 :]
+        self._fast = lambda signal: band @ (band.T @ signal) if rough else signal - smooth @ (smooth.T @ signal)
+        count, self._rough = band.shape[1] if rough else len(t), rough
         speed, position = np.gradient(expected, t), np.array(counts).T * q
         parts = expected, np.cumsum(expected), loaded, speed, even
         wanted, late, heavy, rate, even = map(self._fast, parts)
@@ -235,7 +248,7 @@ class _Block:
         self.size = wanted @ moved / power  # as a multiple of the expected motion
         # standard deviation [m] of rounding, or of noise if that is larger: the range `still` / 2 spans four of them
         noise = q * np.maximum(12**-0.5, ranges / 8)
-        own = np.maximum((moved**2).sum(axis=0) - len(t) * noise**2, len(t) * noise**2)
+        own = np.maximum((moved**2).sum(axis=0) - count * noise**2, count * noise**2)
         fit, tested = self.size**2 * power / own, moved[:, axis]
         both = np.linalg.qr(np.stack([wanted, late], axis=1))[0]
         self.moves = self.span > ranges
@@ -257,6 +270,8 @@ class _Block:
         Each other set has the expected motion, its rate, the motion under a friction of 1 N, and a one-sided fault: of
         a motor (the motion under absolute forces), or of an encoder that loses counts (the length of the path).
         """
+        if self._rough:
+            return [_Fit(np.eye(4)[0], np.array([0, 0, np.inf, 0]), False, 0.0, self._motion[0])] * 3
         delay = _Fit.of(*self._motion, *self._shapes, self._even)
         fits = [delay]
         for _ in range(2):  # Friction and path of the second round follow the motion that the first round has fitted.
@@ -380,7 +395,11 @@ class EncoderTest:
     def _verdict(self) -> str | None:
         """Return the fault that this block shows, "" if the axis has answered well, or None if it has not answered."""
         axis, name, mass = self._axis, f"axis {self._axis + 1}", self._expected.mass[self._axis]
-        self._answer = block = _Block(np.array(self._rows), axis, self._axes, mass)
+        rows, rough = np.array(self._rows), self._expected.rough and math.isfinite(self._expected.mode[axis])
+        block = _Block(rows, axis, self._axes, mass)
+        if rough and not block.follows[axis]:
+            block = _Block(rows, axis, self._axes, mass, rough)
+        self._answer = block
         size, moves, weaker, self._weaker = float(block.size[axis]), block.moves[axis], self._weaker, math.nan
         others = [i + 1 for i in np.flatnonzero(block.follows & (abs(block.size) > _CROSS)).tolist() if i != axis]
         self._swings |= bool(moves and block.swings)
@@ -391,6 +410,8 @@ class EncoderTest:
         delay, *fits = block.fits()
         same = float(delay.shares[0]) or 1.0
         late, doubt = -float(delay.shares[1]) / same, float(delay.doubts[1]) / abs(same)  # [ticks]
+        if rough:
+            late = doubt = 0.0  # A transmission that is not as declared looks like a delay.
         # differences of the motions in the two directions, and the errors of these differences
         wholes = abs(float(fits[0].shares[0])) or 1.0, 1.0
         uneven = [(abs(one.shares[3]) / whole, one.doubts[3] / whole) for one, whole in zip(fits, wholes, strict=True)]
@@ -407,6 +428,10 @@ class EncoderTest:
         if not weak and best.explains and lopsided:
             what = "its encoder loses counts in one direction" if blamed else "its motor is weak in one direction"
             return f"{name} moves much farther in one direction than in the other: {what}"
+        drifts = self._expected.rough and block.span[axis] * self._units.encoder_step[axis] > _DRIFT * block.reach
+        if drifts and not weak:
+            why = "motor or encoder differs between the directions, or something pulls the handle"
+            return f"{name} drifts in one direction under a test force in both directions: its {why}"
         hidden = abs(size) < max(least, 1 / _TEST_RATIO) or late_for_sure
         if hidden and self._unknown_hands and not block.free:
             return None  # A hand that holds the handle can make its motion small or late.
@@ -414,7 +439,7 @@ class EncoderTest:
             wrong = "a positive force moves it to negative counts"
             return f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder"
         unclear = max(map(sum, uneven)) > most_uneven or (self._block and math.isnan(weaker))
-        if weak and (small or lopsided or (unclear and not self._closing)):
+        if weak and (small or lopsided or drifts or (unclear and not self._closing)):
             return None  # dry friction hides much of a weak motion; a stronger force overcomes it
         if not 1 / _TEST_RATIO <= size <= _TEST_RATIO:
             brake = f", or dry friction brakes it{self._axes.limits.raise_cap(axis, '')}" * small

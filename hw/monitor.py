@@ -39,6 +39,8 @@ class LinkSettings:
     baud: int | None = None  # baud rate of a UART; None for a link without UART (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
     test_encoders: bool = True  # whether a small force tests the encoders at every arming
+    #: whether the session identifies a device: forces to play begin after the test, which is not repeated at the end
+    identifies: bool = False
     held: bool = True  # whether the scenario's hands hold the handles in that test (rehearsals), or nobody does
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # whether positions count from the handles' place at arming

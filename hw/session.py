@@ -65,7 +65,7 @@ class Session:
         self.worlds: list[WorldController] = []  # one per arming in a world
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
-        self._expected = Expected(scenario, self.settings.held)
+        self._expected = Expected(scenario, self.settings.held, self.settings.identifies)
         self.missed_while_driving = 0  # ticks without an answer in time while the session drove
         self.request: str | None = None  # what the person at the device must do now
         self.now = self.entered = self.heard = 0  # [us] times of the last call, stage change, and new STATE or ACK
@@ -177,7 +177,8 @@ class Session:
         if not self.armings:
             after, cause = Stage.STOPPED, f"{cause}, before any force acted"
         elif self.settings.test_encoders and not let_go:
-            after, cause = Stage.STOPPED, f"{cause}, before the motors of the last arming were tested at its end"
+            at = "" if self.settings.identifies else " at its end"
+            after, cause = Stage.STOPPED, f"{cause}, before the motors of the last arming were tested{at}"
         return self._end(after, cause, wire.Reason.DONE)
 
     def end(self, stage: Stage, cause: str, now: int) -> Said:

@@ -537,3 +537,97 @@ def test_traces_with_fewer_forces_than_positions_are_refused():
     two, one = np.zeros((3, 2)), np.zeros((3, 1))
     with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
         Trace(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})
+
+
+FAULTS = {
+    "swap": "axis 1 moves encoder 2: axes are swapped",
+    "axis2:reverse": "axis 2 has the wrong sign",
+    "axis1:motor=-1": "axis 1 has the wrong sign",
+    "axis1:motor=3 --scenario omega-pair-rigid": "axis 1 moves 3 times as far as expected of 0.25 kg",
+    "axis2:scale=0.4": "axis 2 moves 0.4 times as far as expected of 0.25 kg",
+    "cross=1": "axis 1 moves encoder 2, too",
+    "axis1:oneway": "axis 1 drifts in one direction",
+    "axis1:freeze": "encoder of axis 1 does not follow",
+}
+
+
+@pytest.mark.parametrize(("fault", "words"), FAULTS.items())
+def test_wrong_axes_are_refused_before_the_excitation(fault, words, tmp_path):
+    """The session ends in the test force of at most 1.3 N, no excitation begins, and no second sitting follows."""
+    options = ["--rehearse", "--measure", "60", "--out", str(tmp_path), "--fault"]
+    assert identify_command([*options, *fault.split()]) == 1
+    report = json.loads((tmp_path / "report.json").read_text())
+    (sitting,) = report["sittings"]
+    assert words in sitting["reason"]
+    assert words in report["session"]["log"][-1]["cause"]
+    assert not (tmp_path / "devices.toml").exists()
+    trace = np.load(tmp_path / "trace-1.npz")
+    assert np.abs(trace["f"]).max() <= 1.3
+    assert trace["t"][-1] < 1.1  # [s] at most four blocks of 120 ms on each axis
+
+
+@pytest.mark.parametrize("kind", ["compliant", "rigid"])
+@pytest.mark.parametrize(("share", "stage"), [(0.4, "stopped"), (0.55, "armed"), (1.7, "armed"), (2.4, "stopped")])
+def test_a_declared_mass_may_be_wrong_by_a_factor(share, stage, kind):
+    """Identification must find masses, so a device passes that has 0.55 to 1.7 times the declared mass.
+
+    The arming test of a session knows the transmission and accepts 10 % more mass only.
+    """
+    declared = load("omega-pair" if kind == "compliant" else "omega-pair-rigid")
+    names = ("motor_mass", "handle_mass") if kind == "compliant" else ("mass",)
+    masses = {name: share * getattr(declared.device[0], name) for name in names}
+    device = msgspec.structs.replace(declared.device[0], **masses)
+    settings = LinkSettings(measure=60, held=False, identifies=True)
+    session = Session(nobody(declared), SafetyLimits((2.0, 2.0)), settings)
+    excitation = chirp(2, declared.T, 1, 1.0, (3.0, 200.0), 0.5)
+    emulator = Emulator(nobody(declared.replace(device=(device, device))))
+    Rehearsal(session, emulator, lambda ages: [excitation]).run_until_armed(1.5)
+    assert session.stage == stage
+    assert stage == "armed" or "as far as expected of 0.25 kg" in session.cause
+
+
+def test_the_excitation_begins_after_the_test():
+    """All forces of the excitation act, none of them before the gain has risen above 0."""
+    scenario, recorder = nobody(load("omega-pair-rigid")), Recorder(2)
+    session = Session(scenario, SafetyLimits((2.0, 2.0)), LinkSettings(measure=60, held=False, identifies=True))
+    session.record = recorder
+    excitation = chirp(2, scenario.T, 1, 1.0, (3.0, 60.0), 0.5)
+    Rehearsal(session, Emulator(scenario), lambda ages: [excitation]).run_until_armed(excitation.seconds + 2.0)
+    link = recorder.link()
+    first = int(np.argmax(link["gain"] > 0))
+    assert link["test"][:first].any()
+    assert not link["test"][first:].any()
+    assert not link["asked"][: first + 1].any()
+    played = link["asked"][first + 1 :][: len(excitation.signal)]
+    np.testing.assert_array_equal(played, excitation.signal)
+
+
+def test_identification_needs_a_dead_man_switch(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="--deadman key needs a terminal"):
+        identify_command(["--port", "x", "--arm"])
+    assert identify_command(["--rehearse", "--measure", "60", "--deadman", "device", "--fault", "letgo@1"]) == 1
+    report = json.loads((tmp_path / "out/identify-I/report.json").read_text())
+    assert "the deadman at the device was let go" in report["reason"]
+    assert len(report["sittings"]) == 1
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_axes_are_checked_by_hand_once(clamped, monkeypatch, tmp_path):
+    """A person moves the axes before the first sitting; sittings with clamped handles have no test force, either."""
+    settings, last = [], SimpleNamespace(last=None)
+
+    def recorded(args, scenario, current, out, number, level=None):
+        settings.append(current)
+        sitting = SimpleNamespace(finished=True, signals=(), reason=None, session=SimpleNamespace(link=last))
+        return SimpleNamespace(**vars(sitting), trace=None)
+
+    monkeypatch.setattr("haptic_loop.cli.identify._sitting", recorded)
+    report = SimpleNamespace(bounded=clamped)
+    monkeypatch.setattr("haptic_loop.cli.identify._identified", lambda scenario, sittings: report)
+    options = ["--port", "x", "--arm", "--no-dead-man", *["--transmission"] * clamped, "--out", str(tmp_path)]
+    with pytest.raises(AttributeError):  # the report is left out
+        identify_command(options)
+    expected = [(True, True), (True, False), *[(False, False)] * 2 * clamped]
+    assert [(each.test_encoders, each.check_axes) for each in settings] == expected
+    assert all(each.identifies and not each.held for each in settings)

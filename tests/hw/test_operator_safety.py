@@ -21,7 +21,7 @@ from shared import FakePort
 
 from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser
-from haptic_loop.cli.session_cli import limits_from, touched
+from haptic_loop.cli.session_cli import limits_from, touched, with_person
 from haptic_loop.hw import transport
 from haptic_loop.hw.control import CouplingRequest, TraceRow, certified_couplings
 from haptic_loop.hw.driver import Driver, Operator
@@ -246,11 +246,11 @@ def test_the_identified_speed_limits_sessions(scenario):
         limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.6"]), slow)
 
 
-def test_live_sessions_use_a_deadman_unless_refused(scenario, monkeypatch):
+def test_live_sessions_use_a_deadman_unless_refused(monkeypatch):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     for options, asked in (([], "key"), (["--deadman", "device"], "device"), (["--no-dead-man"], None)):
         args = _parser().parse_args(["--port", "x", *options])
-        limits_from(args, scenario)
+        assert with_person(args, LinkSettings()).deadman == (asked == "device")
         assert args.deadman == asked
 
 
@@ -315,12 +315,12 @@ def test_forces_cut_over_half_a_second_stop_sessions(scenario, link_couplings, b
     ],
 )
 def test_impossible_limits_are_refused(scenario, options, words):
+    def limited():
+        args = _parser().parse_args([*options, *["--rehearse"] * ("--port" not in options)])
+        session_for(scenario, with_person(args, LinkSettings()), **limits_from(args, scenario))
+
     with pytest.raises(InputError) as error:
-        session_for(
-            scenario,
-            LinkSettings(),
-            **limits_from(_parser().parse_args([*options, *["--rehearse"] * ("--port" not in options)]), scenario),
-        )
+        limited()
     assert says(error.value, words)
 
 
