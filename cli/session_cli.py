@@ -23,6 +23,7 @@ from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
 from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import lost_output
+from haptic_loop.design.own import called, named
 from haptic_loop.hw.boards import Boards, ticks_behind
 from haptic_loop.hw.control import Armable
 from haptic_loop.hw.driver import Operator
@@ -49,10 +50,9 @@ def add_link_options(parser: options.Parser) -> None:
     """Add the options of the link between host and device."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
-    port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
-    port += (
-        f"{FORCE_DIMENSION}[:0x,sn4711x]: index or serial number of a device and letter of its axis, for each channel"
-    )
+    port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; "
+    port += f"{FORCE_DIMENSION}[:0x,sn4711x]: index or serial number of a device and letter of its axis, for each "
+    port += "channel; or FILE.py:NAME of your own device"
     add("--port", metavar="PATH", help=port)
     virtual = "run the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
@@ -77,8 +77,8 @@ def add_link_options(parser: options.Parser) -> None:
     parser.only("with --rehearse: faults act on an emulated device", lambda args: args.rehearse, "fault")
     parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
     parser.only(f"with --port {FORCE_DIMENSION}", host_clocked, "clamped")
-    uart = f"with a serial port or --rehearse: {FORCE_DIMENSION} has no UART"
-    parser.only(uart, lambda args: not host_clocked(args), "baud")
+    uart = f"with a serial port or --rehearse: {FORCE_DIMENSION} and your own device have no UART"
+    parser.only(uart, lambda args: not host_clocked(args) and not _own(args), "baud")
     parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
 
 
@@ -231,9 +231,9 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
 
 
 def _ports(args: argparse.Namespace) -> list[str]:
-    """Return the paths of the serial ports in --port, none if `host_clocked`. Raises InputError for an empty path."""
+    """Return the paths of the serial ports in --port, if there are any. Raises InputError for an empty path."""
     port: str = args.port or ""
-    paths = [] if host_clocked(args) else port.split(",")
+    paths = [] if host_clocked(args) or _own(args) else port.split(",")
     if port and "" in paths:
         raise InputError(f"--port is {port!r}: path {paths.index('') + 1} of {len(paths)} is empty")
     return paths
@@ -242,6 +242,11 @@ def _ports(args: argparse.Namespace) -> list[str]:
 def host_clocked(args: argparse.Namespace) -> bool:
     """Return whether --port names a device without a clock, so that the host times its ticks."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
+
+
+def _own(args: argparse.Namespace) -> bool:
+    """Return whether --port names a user's own device, FILE.py:NAME."""
+    return Path((args.port or "").split(":")[0]).suffix == ".py"
 
 
 @dataclass(frozen=True)
@@ -326,6 +331,8 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
         if adapter.unused_axes and not args.clamped:
             _ask_for_clamp("; ".join(adapter.unused_axes))
         return adapter
+    if _own(args):
+        return _own_device(args.port, session.scenario, stack)
     with progress("opening the port"):
         ports = [stack.enter_context(SerialPort(path, session.settings.baud)) for path in _ports(args)]
     serial = partial(SerialDevice, clock=lambda: args.pace * time.monotonic())
@@ -335,6 +342,20 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
     devices = [serial(port, patience=0.0) for port in ports]
     now = lambda: int(args.pace * time.monotonic_ns()) // 1000  # noqa: E731
     return Boards(devices, axes, session.settings.behind, now, lambda seconds: _wait_for_any(ports, seconds))
+
+
+def _own_device(text: str, scenario: Scenario, stack: ExitStack) -> HapticDevice:
+    """Return the device that NAME of FILE.py makes for the scenario. Raises InputError if it lacks a call."""
+    make = named("--port", text)
+    if not callable(make):
+        raise InputError(f"--port {text} is {make!r}, expected a class or function that takes a scenario")
+    device: Any = called(f"--port {text}", make, scenario)
+    if hasattr(device, "__enter__"):
+        device = stack.enter_context(device)
+    lacking = [name for name in ("info", "configure", "exchange", "stop", "errors") if not hasattr(device, name)]
+    if lacking:
+        raise InputError(f"--port {text} makes {device!r} without {', '.join(lacking)}: see hw/haptic_device.py")
+    return device
 
 
 def _wait_for_any(ports: Sequence[SerialPort], seconds: float) -> None:

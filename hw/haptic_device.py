@@ -1,8 +1,9 @@
 """The four calls to a device that a session needs. `Driver` in hw/driver.py makes them.
 
 There are three implementations: a device at a serial port (docs/protocol.md), several of them (hw/boards.py), and
-devices that the host clocks (hw/force_dimension.py). A call waits for at most 0.5 ms, or to the end of the tick if the
-host is the clock, because keys, signals and time-outs are handled between two calls.
+devices that the host clocks (hw/force_dimension.py); users write others (docs/extending.md). A call waits for at most
+0.5 ms, or to the end of the tick if the host is the clock, because keys, signals and time-outs are handled between two
+calls.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ class HapticDevice(Protocol):
         ...
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send a configuration. Return Refused.ACCEPTED or the reason for a refusal; None until an answer comes."""
+        """Send a configuration. Return Refused.ACCEPTED or the reason for a refusal.
+
+        Return None until an answer comes, and while the device ramps its force to zero (Refused.RUNNING).
+        """
         ...
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
