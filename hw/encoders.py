@@ -74,6 +74,14 @@ class EncoderNoise:
                 own, least = max(recent) - min(recent), self.range[i]
                 self.range[i] = own if least is None else min(own, least)
 
+    def above(self, widest: float, units: Units) -> str | None:
+        """Return a message about an encoder whose noise exceeds one count and `widest` [m], or None."""
+        for i, (least, q) in enumerate(zip(self.range, units.encoder_step, strict=True), start=1):
+            if least and least > 1 and least * q > widest:
+                noise = f"its positions vary by {1e3 * least * q:.3g} mm within {_REST:g} s"
+                return f"encoder {i} is noisy at rest: {noise}, at most {1e3 * widest:g} mm is allowed"
+        return None
+
     @property
     def still(self) -> tuple[int, ...]:
         """Return the range (m,) [counts] in which an encoder rests: twice its noise, but 1 for a noise of up to 1.

@@ -143,6 +143,11 @@ class SafetyLimits:
         _require_finite(force)
         return _Shaped(tuple(force), clipped, slowed)
 
+    @property
+    def widest(self) -> float:
+        """The largest encoder step, and the largest noise of an encoder at rest, that a session allows [m]."""
+        return _COARSEST * self.jump
+
     def capped(self, forces: NDArray[np.float64], at: float = 1.0) -> NDArray[np.bool_]:
         """Return where forces (ticks, m) [N] reach the share `at` of their caps; a vector counts by its length."""
         size = np.abs(forces)
@@ -201,7 +206,7 @@ class SafetyLimits:
             if seconds > scenario.T:
                 more = f"more than T = {1e6 * scenario.T:g} us (for a link without UART, give --baud none)"
                 reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
-        units, widest = Units.of(info), _COARSEST * self.jump
+        units, widest = Units.of(info), self.widest
         device = info.osp_damping, units.encoder_step, units.force_step, info.hard_limit
         axes = zip(*device, scenario.delta, self.cap, strict=True)
         for i, (damping, count, step, hard, delta, cap) in enumerate(axes, start=1):

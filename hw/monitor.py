@@ -23,8 +23,9 @@ _MISSED = 0.2  # largest share of missing answers; loops with a larger share may
 _STATES_PER_ANSWER = 8  # most STATEs per measured age: a STATE reports one margin for all FORCEs of a USB frame
 _INFERRED = 0.005  # largest share of inferred ages: half of the 1 % of ages that the default quantile leaves out
 _UNTOLD = 0.9  # largest share of STATEs without a margin; USB frames that carry several FORCEs cause some
-_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
-_BLOCK = 200  # ticks over which clocks are compared, and late and missing answers are counted
+_DRIFT = 0.01  # largest relative drift of a clock in a block
+_BLOCK = 200  # ticks over which the device's clock is compared, and late and missing answers are counted
+_HOST_BLOCK = 2000  # ticks over which the host's clock is compared: a busy host may read its clock 20 ticks late
 _CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of the device
 _REMEMBERED = 64  # most forces or latches that are stored; at most the last theta still matter
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
@@ -204,7 +205,7 @@ class Measurement:
         if part > _MISSED:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         elapsed, ticks = (state.t_us - self._first.t_us) & 0xFFFFFFFF, distance(state.tick, self._first.tick)
-        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DEVICE_TOLERANCE:
+        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DRIFT:
             each = f"{elapsed / ticks:.1f} us by its time stamps, T is {self._T_us:g} us"
             raise SafetyStop(f"a tick of the device lasts {each}")
         if self._sent is None and len(self._answers.inferred) > _INFERRED * len(ages):
@@ -338,7 +339,7 @@ class _ClockDrift:
 
     measure: str  # name of the clock in messages
     T_us: float
-    tolerance: float  # largest drift, as a part of a block
+    block: int  # [ticks]
     forgiven_us: float  # [us] most that a block excludes of its longest delay
     _last: int | None = None
     _ticks: int = 0
@@ -356,11 +357,13 @@ class _ClockDrift:
             self._ticks += ticks
             if drift > 0:
                 drift -= min(self._freeze, drift)
-            if abs(drift) > self.tolerance * _BLOCK * self.T_us:
+            if abs(drift) > _DRIFT * self.block * self.T_us:
                 lasts = self.T_us + drift / self._ticks
                 what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
+                if lasts <= 0:
+                    raise SafetyStop(f"the time by {self.measure} goes back {what}")
                 raise SafetyStop(f"a tick of the device lasts {lasts:.4g} us by {self.measure} {what}")
-            if self._ticks >= _BLOCK:
+            if self._ticks >= self.block:
                 self._ticks, self._behind, self._freeze = 0, 0.0, 0.0
         self._last = at_us
 
@@ -371,8 +374,8 @@ class ClockMonitor:
     def __init__(self, watchdog_us: int, T: float) -> None:
         T_us = 1e6 * T
         self.most = max(1, int(watchdog_us / T_us))  # [ticks] largest advance from one STATE to the next
-        self._device = _ClockDrift("its time stamps", T_us, _DEVICE_TOLERANCE, watchdog_us)
-        self._host = _ClockDrift("the host's clock", T_us, _HOST_TOLERANCE, watchdog_us)
+        self._device = _ClockDrift("its time stamps", T_us, _BLOCK, watchdog_us)
+        self._host = _ClockDrift("the host's clock", T_us, _HOST_BLOCK, watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
         """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` ticks after the previous one."""

@@ -128,16 +128,21 @@ class Session:
         return self._take(0, "certified")
 
     def arm(self, now: int) -> Said:
-        """Arm a disarmed session at a person's request, or log its `hindrance` instead. Ignore other stages."""
+        """Arm a disarmed session at a person's request, or log its `hindrance` instead. Ignore other stages.
+
+        If an encoder is too noisy, the session ends.
+        """
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
             self._log(hindrance)
         elif self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
+            assert self._noise
+            if noisy := self._noise.above(self.limits.widest, self.units):
+                return self._end(Stage.REFUSED, noisy)
             arming = Arming(len(self.armings), self.program, self.config, *self._accounts(self.config))
             self.armings.append(arming)
-            assert self._noise
             axes = CheckedAxes(self.limits, self.units, self.scenario.T, self._noise.still)
             self.drive = Drive(arming, axes, self._expected, self.settings, self.counters, self.record)
             if self.drive.world:

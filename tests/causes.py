@@ -52,6 +52,8 @@ CAUSES = {
     "tick leap": "the tick number leapt by, the watchdog allows",
     "device clock": "a tick of the device lasts us by its time stamps over ticks, T is us",
     "host clock": "a tick of the device lasts us by the host's clock over ticks, T is us",
+    "noisy encoder": "encoder is noisy at rest: its positions vary by mm within s, at most mm is allowed",
+    "clock goes back": "the time by its time stamps goes back over ticks, T is us",
     "armed itself": "the device is armed without a command",
     "disarmed itself": "the device has disarmed itself",
     "deaf device": "the device still drives ms after STOP: cut its power",

@@ -487,6 +487,15 @@ def test_the_expected_motion_is_the_closed_form():
 # noise
 
 
+@pytest.mark.parametrize(("noise", "stage"), [(2, Stage.FINISHED), (20, Stage.REFUSED)])
+def test_encoders_with_much_noise_do_not_arm(scenario, link_couplings, noise, stage):
+    """The range of 83 normal errors is about 5 standard deviations: 0.1 mm for 2 counts of 10 um, 1 mm for 20."""
+    settings = {"encoder_step": 1e-5, "seconds": 3.0, "stop": 1.0}
+    session, _ = session_with(scenario, link_couplings, f"axis1:noise={noise}", **settings)
+    assert session.stage == stage
+    assert stage == Stage.FINISHED or cause_of(session.cause).startswith("noisy encoder: 1 ")
+
+
 @pytest.mark.parametrize("noise", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_dead_encoders_with_noise_are_found(scenario, link_couplings, noise):
     """Dead encoders with noise are found, before and while forces act.
