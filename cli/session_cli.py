@@ -322,17 +322,17 @@ def _logged(session: Session, out: Path) -> IncidentLog:
 
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
+    scenario = axis_by_axis(options.scenario_from(args))  # The session of hw.identify assumes almost no damping.
     if host_clocked(args):
-        adapter = stack.enter_context(
-            ForceDimension(session.scenario, args.port.partition(":")[2] or None, deadman=session.settings.deadman)
-        )
+        axes = args.port.partition(":")[2] or None
+        adapter = stack.enter_context(ForceDimension(scenario, axes, deadman=session.settings.deadman))
         if not adapter.guarded:
             console(args).print("the device has no watchdog: if this program is killed, the last force stays on")
         if adapter.unused_axes and not args.clamped:
             _ask_for_clamp("; ".join(adapter.unused_axes))
         return adapter
     if _own(args):
-        return _own_device(args.port, session.scenario, stack)
+        return _own_device(args.port, scenario, stack)
     with progress("opening the port"):
         ports = [stack.enter_context(SerialPort(path, session.settings.baud)) for path in _ports(args)]
     serial = partial(SerialDevice, clock=lambda: args.pace * time.monotonic())

@@ -83,6 +83,14 @@ def test_a_session_drives_the_users_own_device(file, module, tmp_path, latch, de
     module.opened.clear()
 
 
+@pytest.mark.slow
+def test_the_users_own_device_is_identified(file, module, tmp_path):
+    options = ["--arm", "--no-dead-man", "--no-axis-check", "--sittings", "1", "--json", str(tmp_path / "r.json")]
+    assert identify.main(["--port", f"{file}:Emulated", *options, "--out", str(tmp_path)]) == 1  # one sitting: no bound
+    axes = json.loads((tmp_path / "r.json").read_text())["axes"]
+    assert [axis["friction"]["viscous"] for axis in axes] == pytest.approx([1.37, 1.37], rel=1e-3)
+
+
 def test_the_page_waits_for_a_ramp(module):
     device = module.Emulated(load())
     config = Config(1, 4, 5, 0, (5000, 5000), (5000, 5000))
@@ -106,7 +114,7 @@ def test_the_page_waits_for_a_ramp(module):
 )
 def test_mistakes_in_own_devices_are_one_line(file, module, name, said):
     for command in (bridge, identify):
-        options = OPTIONS if command is bridge else ["--arm"]
+        options = OPTIONS if command is bridge else ["--arm", "--no-dead-man"]
         with pytest.raises(InputError, match=rf"--port .*emulated\.py:{name}.* {said}") as refused:
             command.main(["--port", f"{file}:{name}", *options])
         assert "\n" not in str(refused.value)
