@@ -7,6 +7,7 @@
 static int expert, status[2][17];
 static double forces[2][3], limits[2];
 static unsigned char watchdogs[2];
+static int buttons[2];
 
 void dhdGetSDKVersion(int *major, int *minor, int *release, int *revision) {
     *major = 3, *minor = 17, *release = 6, *revision = 0;
@@ -26,6 +27,7 @@ int dhdEnableForce(unsigned char on, signed char ID) {
     return status[(int)ID][5] = on, 0;
 }
 int dhdGetStatus(int out[17], signed char ID) { return memcpy(out, status[(int)ID], sizeof status[0]), 0; }
+int dhdGetButton(int index, signed char ID) { return index == 0 && buttons[(int)ID]; }
 int dhdGetPosition(double *x, double *y, double *z, signed char ID) { return (void)ID, *x = *y = *z = 0.0, 0; }
 int dhdSetForce(double x, double y, double z, signed char ID) {
     forces[(int)ID][0] = x, forces[(int)ID][1] = y, forces[(int)ID][2] = z;
@@ -33,6 +35,7 @@ int dhdSetForce(double x, double y, double z, signed char ID) {
 }
 /* Calls with which the test sets the status and reads forces, limits and watchdogs. */
 void stub_status(int ID, int index, int value) { status[ID][index] = value; }
+void stub_button(int ID, int pressed) { buttons[ID] = pressed; }
 double stub_force(int ID, int axis) { return forces[ID][axis]; }
 double stub_limit(int ID) { return limits[ID]; }
 int stub_watchdog(int ID) { return watchdogs[ID]; }

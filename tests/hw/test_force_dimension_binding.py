@@ -83,6 +83,13 @@ with ForceDimension(load("omega-space"), six, sdk, clock, sleep) as device:
     for command, force in ((Command.ARM, (0,) * 6), (Command.RUN, (1000, -500, 250, 100, 200, -300))):
         state = device.exchange(Force(command, state.tick, state.tick, force))
     said["space"] = [stub.stub_force(index, axis) for index in (0, 1) for axis in range(3)]
+with ForceDimension(load(), "sn4711x,sn4712x", sdk, clock, sleep, deadman=True) as device:
+    device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
+    said["buttons"] = []
+    for ID in (0, 1):
+        said["buttons"].append(device.exchange(None).deadman)
+        stub.stub_button(ID, 1)
+    said["buttons"].append(device.exchange(None).deadman)
 print(json.dumps(said))
 """
 
@@ -133,6 +140,10 @@ def test_forces_reach_the_axes_they_are_for(session):
 
 def test_a_configuration_waits_for_the_ramp(session):
     assert session["ramped"] == [[None] * 5 + [0], 0.0]  # a ramp of five ticks
+
+
+def test_the_deadman_is_a_button_of_every_device(session):
+    assert session["buttons"] == [False, False, True]
 
 
 def test_three_axes_of_a_device_share_a_limit(session):
