@@ -8,6 +8,7 @@ with clamped handles follow, for the bounds of motor mass and transmission that 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ from haptic_loop.sim.scenario import InputError, Scenario
 # Shares of --force in the two sittings with clamped handles; a difference between these sittings shows backlash.
 _LEVELS = 1.0, 0.5
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
+#: fields of a device that devices.toml takes from the scenario, the last one only where it is not identified
+_DECLARED = "force_limit", "encoder_step", "friction_max", "credible_force", "transmission_damping"
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +261,8 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
     """Return a [[device]] table. `axes` and `bounds` have one entry per free axis.
 
     Masses and the transmission are means over the axes; each bound is the worst of the axes. Without bounds, and
-    without an estimate for every axis, the stiffness is the declared one.
+    without an estimate for every axis, the stiffness is the declared one. Fields that are not identified are as
+    declared.
     """
 
     def listed(figures: Sequence[str]) -> str:
@@ -276,6 +280,8 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
     lines.append(f"credible_speed = {_floored(speed, 3)}  {comment}")
     if device.axes > 1:
         lines += [f"axes = {device.axes}", f"clamped = {list(device.clamped)}"]
+    declared = {name: getattr(device, name, None) for name in _DECLARED[: 5 - bool(bounds)]}
+    lines += [f"{name} = {json.dumps(value)}" for name, value in declared.items() if value]
     if isinstance(device, RigidDevice):
         return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
     if bounds:

@@ -28,7 +28,7 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
-from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.device import CompliantDevice, RigidDevice
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
@@ -631,3 +631,20 @@ def test_axes_are_checked_by_hand_once(clamped, monkeypatch, tmp_path):
     expected = [(True, True), (True, False), *[(False, False)] * 2 * clamped]
     assert [(each.test_encoders, each.check_axes) for each in settings] == expected
     assert all(each.identifies and not each.held for each in settings)
+
+
+@pytest.mark.parametrize("kind", [RigidDevice, CompliantDevice])
+def test_declared_limits_stay_in_the_table(kind):
+    """Limits and steps are data of the device, which no record shows."""
+    more = {"transmission_damping": 0.3, "credible_force": 20.0} if kind is CompliantDevice else {}
+    device = kind(axes=2, force_limit=4.8, encoder_step=(1e-5, 2e-5), friction_max=0.1, **more)
+    axis = SimpleNamespace(
+        viscous=1.0,
+        delta=0.5,
+        friction=SimpleNamespace(mass=0.2),
+        viscosity=SimpleNamespace(speed=0.6),
+        transmission=None,
+    )
+    read = msgspec.convert(tomllib.loads(_table(device, [axis, axis], None))["device"][0], kind)
+    for name in ("force_limit", "encoder_step", "friction_max", *more):
+        assert getattr(read, name) == getattr(device, name)
