@@ -77,7 +77,7 @@ class BoxProblem(_Problem):
 
     If M is a P-matrix, there is exactly one solution for every q. If M is symmetric and only positive semidefinite, as
     for an environment without a connection to ground, f is still unique. The enumeration skips singular active sets,
-    and pivoting regularises M.
+    and pivoting regularises M (`grounded`).
 
     Raises:
         SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.
@@ -105,11 +105,33 @@ class BoxProblem(_Problem):
         return v, np.minimum(np.maximum(f, lower), upper)
 
     @cached_property
+    def _unit(self) -> Array:
+        """M with rows and columns scaled so that its diagonal consists of ones and zeros."""
+        size = np.abs(np.diag(self.M))
+        scale = np.sqrt(np.where(size > 0, size, 1.0))
+        return self.M / scale / scale[:, None]
+
+    @cached_property
+    def weight(self) -> Array:
+        """(n,) factors that make the v of each force comparable with forces.
+
+        They are the diagonal of M, or the largest entry of the column where the diagonal is zero, as for a force that
+        only a wall in contact changes.
+        """
+        diagonal, most = np.diag(self.M), np.abs(self.M).max(axis=0)
+        return np.where(diagonal > GROUNDED * most, diagonal, most)
+
+    def grounded(self, share: float = GROUNDED) -> Array:
+        """Return M. If it is singular, this share of `weight` is added for limited forces, but not for walls."""
+        if self.regular:
+            return self.M
+        return self.M + share * np.diag(np.where(np.isfinite(self.lower), self.weight, 0.0))
+
+    @cached_property
     def regular(self) -> bool:
         """Whether all checked principal minors are positive. Raises SingularLoop if one is negative."""
         n = len(self.M)
-        scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
-        unit, regular = self.M / scale / scale[:, None], True
+        unit, regular = self._unit, True
         for size in range(1, n + 1) if n <= 10 else (1,):
             for chosen in itertools.combinations(range(n), size):
                 minor = np.linalg.det(unit[np.ix_(chosen, chosen)])
@@ -127,24 +149,24 @@ class BoxProblem(_Problem):
         than _MOST_CANDIDATES sets. The slack is nonnegative if v has the sign of its limit and every free force is
         within both limits.
         """
-        n, diagonal, one = len(self.M), self._diagonal[:, 0], np.eye(len(self.M))
+        n, weight, one = len(self.M), self.weight, np.eye(len(self.M))
         kinds = [
             [0.0, *[1.0] * bool(np.isfinite(b)), *[-1.0] * bool(np.isfinite(a))]
             for a, b in zip(self.lower, self.upper, strict=True)
         ]
         if np.prod([len(kind) for kind in kinds]) > _MOST_CANDIDATES:
             return ()
-        scale, sets = np.sqrt(np.maximum(np.abs(diagonal), 1e-300)), []
+        sets = []
         for signs in map(np.array, itertools.product(*kinds)):
             active = np.flatnonzero(signs)
             chosen = np.ix_(active, active)
-            if np.linalg.det((self.M / scale / scale[:, None])[chosen]) > _LEAST_MINOR:
+            if np.linalg.det(self._unit[chosen]) > _LEAST_MINOR:
                 v, free = np.zeros((n, n)), signs == 0
                 v[chosen] = np.linalg.inv(self.M[chosen])
                 bounds = np.where(signs > 0, self.upper, np.where(signs < 0, self.lower, 0.0))
                 f = np.where(free[:, None], one - self.M @ v, 0.0)  # q - M v if free, and exactly the limit if active
                 v_one, f_one = -v @ bounds, np.where(free, self.M @ v @ bounds, bounds)
-                pushed, pushed_one = (signs * diagonal)[:, None] * v, signs * diagonal * v_one
+                pushed, pushed_one = (signs * weight)[:, None] * v, signs * weight * v_one
                 below, above = np.where(free[:, None], -f, pushed), np.where(free[:, None], f, pushed)
                 room_below = np.where(free, self.upper - f_one, pushed_one)
                 room_above = np.where(free, f_one - self.lower, pushed_one)
@@ -173,7 +195,7 @@ class BoxProblem(_Problem):
         holds for index n - 1, and so on.
         """
         n, k = q.shape
-        M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
+        M = self.grounded()
         lower, upper, one = self.lower[:, None], self.upper[:, None], np.eye(n)
         signs, v, left = np.zeros((n, k)), np.zeros((n, k)), np.arange(k)
         for turn in range(4 * n + 3**n):
@@ -185,7 +207,7 @@ class BoxProblem(_Problem):
             f = at - M @ now
             tiny = PIVOT_ROUNDING * (np.abs(at) + np.abs(M) @ np.abs(now))
             high, low = (s == 0) & (f > upper + tiny), (s == 0) & (f < lower - tiny)
-            wrong = high | low | (s * now * self._diagonal < -tiny)
+            wrong = high | low | (s * now * self.weight[:, None] < -tiny)
             if turn >= 4 * n:
                 wrong &= np.cumsum(wrong, axis=0) == 1
             signs[:, left] = np.where(wrong, np.where(high, 1.0, np.where(low, -1.0, 0.0)), s)

@@ -94,6 +94,12 @@ class Law(ReadOnly):
         return np.array([w.stiffness + w.damping / self.sent.T for w in self.walls])
 
     @cached_property
+    def problem(self) -> BoxProblem | BallProblem:
+        """The problem of a tick with the wall forces p as unknowns. Its rows are scaled to N."""
+        w = len(self.walls)
+        return BoxProblem(self.steepness[:, None] * self._problem.M, np.full(w, -np.inf), np.zeros(w))
+
+    @cached_property
     def _problem(self) -> Complementarity:
         m = self.channels
         return Complementarity(np.diag(1 / self.steepness) - self.sent.D[m:, m:])
@@ -113,6 +119,18 @@ class Law(ReadOnly):
         G, m, w = self._block, self.channels, len(self.walls)
         A, B = np.pad(G.A, ((0, w), (0, w))), np.pad(G.B[:, :m], ((0, w), (0, 0)))
         return Lti(A, B, np.pad(G.C[:m], ((0, 0), (0, w))), G.D[:m, :m], G.T)
+
+    @cached_property
+    def uncut(self) -> tuple[Lti, Array]:
+        """A tick before its inequalities, for code that solves them by itself: a block and a matrix.
+
+        The block is `open`, but the last w rows of A and B give the displacements y across the walls. The matrix
+        (m + order, n) maps the n unknowns of the tick to [f; z+], where y takes the place of h.
+        """
+        G, m, w, F = self._block, self.channels, len(self.walls), self.open
+        A = np.vstack([F.A[: G.order], np.pad(G.C[m:], ((0, 0), (0, w)))])
+        block = Lti(A, np.vstack([F.B[: G.order], G.D[m:, :m]]), F.C, F.D, F.T)
+        return block, np.vstack([G.D[:m, m:], G.B[:, m:], G.D[m:, m:]])
 
     @property
     def linear(self) -> Array:

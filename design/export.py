@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, BallProblem, BoxProblem, magnitudes
-from haptic_loop.controller.law import Limiter
+from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.ranges import where_proved
 from haptic_loop.design.certificate import Verdict, covered, limiter_rho
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.result import RANGES, listed
+from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, listed
 
 # ----------------------------------------------------------------------------------------------------
 # An export is one state-space block with a fixed order of its sums, and a test vector in that order.
@@ -37,7 +37,12 @@ from haptic_loop.design.result import RANGES, listed
 # the unlimited forces, f the limited forces and e the slips. The tick makes the first wrong limit active or inactive
 # until none is wrong. This takes finitely many switches (docs/theory.md). The elimination keeps the order of the
 # channels and needs no pivoting, because all principal minors are positive. The tick then adds KICK e to [y; z+], with
-# the matrix `kick` of controller.law.Limiter, and sets the sent forces to f.
+# the matrix of controller.law.Law.uncut, and sets the sent forces to f.
+#
+# Every wall adds a row to this problem, with q = a (d - c) of controller.law, the upper limit 0, and the wall's force
+# in e. These rows come first, because a slip may change a force only through a wall, so that its own pivot is 0 until
+# the wall is eliminated. The last states are the depths h in the walls. Their rows in A, B and KICK give the
+# displacements y across the walls, and then h = max(0, y - gap).
 #
 # If the force of a device is limited as a vector, the tick solves controller.complementarity.BallProblem instead. It
 # takes Newton steps in u = f + tau e. A step that does not halve the residual is replaced by a step of the
@@ -77,12 +82,18 @@ class ExportedBlock:
     input: _Signal
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
-    limiter: Limiter | None = None  # None without one; otherwise `system` is the block while no force is limited
+    law: Law | None = (
+        None  # None if linear; otherwise `system` is the block while no force is limited and no wall touches
+    )
     single: tuple[float, float] | None = None  # (largest error, largest output) of single precision; None for double
 
     @property
     def dtype(self) -> type[np.floating]:
         return np.float32 if self.single else np.float64
+
+    @property
+    def limiter(self) -> Limiter | None:
+        return self.law if isinstance(self.law, Limiter) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,40 +129,38 @@ def process_block(
         balls: Groups of channels; the limiter limits the forces of each group as one vector.
 
     Raises:
-        ValueError: The loop is not linear, or the certificate covers no limiter.
+        ValueError: The environment is a MuJoCo world, or the certificate covers no limiter.
     """
     loop, delays = stored.loop, _delays(stored.loop, with_theta)
     if not with_theta:
         loop = loop.delayed((0,) * loop.channels)
     if getattr(loop.environment, "world", None):
         raise ValueError("a MuJoCo world is no linear block: export the coupling alone, without --process")
-    if loop.environment.walls:
-        raise ValueError("environment.walls: contact that makes and breaks is not a linear block")
+    walls, about = len(loop.environment.walls), "f = F x: the whole discrete process; the devices get -f, held for T. "
+    push = f"{walls} wall{'s' * (walls > 1)} can push, but not pull: contacts begin and end." if walls else ""
     if force_limit is not None:
-        return _limited_block(stored, loop, force_limit, balls, delays)
-    about = (
-        "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
-        delays,
-    )
-    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, _FORCE, about)
+        law = _limiter(stored, loop, force_limit, balls)
+        limited = "Lengths of a device's force vector" if balls else "Forces"
+        about = (
+            f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
+            f"{', '.join(f'{f:g}' for f in force_limit)} N while positions and states are "
+            "finite: the virtual contact slips instead. NaN and infinity stay in the state until the reset."
+        )
+        return ExportedBlock(
+            "process", law.uncut[0], _DISPLACEMENT, _FORCE, (about, *[push] * bool(walls), delays), law
+        )
+    about += "Forces are not limited here."
+    if walls:
+        law = loop.law(stored.built())
+        return ExportedBlock("process", law.uncut[0], _DISPLACEMENT, _FORCE, (about, push, delays), law)
+    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, _FORCE, (about, delays))
 
 
-def _limited_block(
-    stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice], delays: str
-) -> ExportedBlock:
+def _limiter(stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice]) -> Law:
     rho = limiter_rho(stored.loop, stored.certificate)
     if rho is None:
         raise ValueError("the certificate covers no limited forces: design the coupling anew, or omit --force-limit")
-    sent, limit = loop.sent(stored.built()), np.array(force_limit)
-    limiter = Limiter(sent, loop.theta, limit=limit, rho=np.array(rho), balls=tuple(balls))
-    limited = "Lengths of a device's force vector" if balls else "Forces"
-    about = (
-        f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
-        f"{', '.join(f'{f:g}' for f in force_limit)} N while positions and states are "
-        "finite: the virtual contact slips instead. NaN and infinity stay in the state until the reset.",
-        delays,
-    )
-    return ExportedBlock("process", limiter.open, _DISPLACEMENT, _FORCE, about, limiter)
+    return loop.law(stored.built(), force_limit, rho, balls)
 
 
 def _with_a_state(system: Lti) -> Lti:
@@ -165,26 +174,41 @@ def _with_a_state(system: Lti) -> Lti:
 def trial(block: ExportedBlock) -> _Trial:
     """Return normally distributed random inputs and their outputs.
 
-    For a limiter, inputs are scaled so that unlimited forces would exceed a limit on a third of the ticks.
+    For a limiter, inputs are scaled so that unlimited forces would exceed a limit on a third of the ticks. With walls,
+    inputs reach every wall (`_inputs`), and a limiter scales only their second half, so that unlimited forces would
+    exceed a limit on a sixth of the ticks.
     """
-    rng = np.random.default_rng(0)
-    inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
-    if block.limiter:
-        share = magnitudes(_sequential(block.system, inputs).T, block.limiter.sizes).T / block.limiter.limit
-        inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
+    inputs, law, limiter = _inputs(block, _TICKS), block.law, block.limiter
+    if limiter:
+        walls = len(limiter.walls)
+        free = _sequential(block.system, inputs, limiter.unlimited if walls else None)
+        share = (magnitudes(free.T, limiter.sizes).T / limiter.limit).max(axis=1)
+        often = np.quantile(share, 5 / 6 if walls else 2 / 3)
+        inputs[_TICKS // 2 if walls else 0 :] /= often or 1.0
     inputs = inputs.astype(block.dtype)
-    return _Trial(inputs, _sequential(block.system, inputs, block.limiter, block.dtype))
+    return _Trial(inputs, _sequential(block.system, inputs, law, block.dtype))
 
 
 def in_single_precision(block: ExportedBlock) -> ExportedBlock:
     """Return the block in single precision, with its largest difference from double precision over _COMPARED ticks."""
-    rng = np.random.default_rng(0)
-    inputs = block.input.size * rng.standard_normal((_COMPARED, block.system.inputs))
-    double, single = (_sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
+    inputs = _inputs(block, _COMPARED)
+    double, single = (_sequential(block.system, inputs, block.law, kind) for kind in (np.float64, np.float32))
     error, largest = float(np.abs(double - single).max()), float(np.abs(double).max())
     line = f"Single precision: {_COMPARED} ticks differ from double precision by at most {error:.2g} where the largest "
     line += f"{block.output.what} is {largest:.3g}. No proof covers this rounding."
     return replace(block, single=(error, largest), about=(*block.about, line))
+
+
+def _inputs(block: ExportedBlock, ticks: int) -> Array:
+    """Return random inputs (ticks, m). Where no wall touches, they reach each wall's gap on a third of the ticks."""
+    G, walls = block.system, block.law.walls if block.law else ()
+    inputs, w = block.input.size * np.random.default_rng(0).standard_normal((ticks, G.inputs)), len(walls)
+    if walls:
+        across = _sequential(Lti(G.A, G.B, G.A[-w:], G.B[-w:], G.T), inputs[:_TICKS])
+        often = np.quantile(np.abs(across), 1 / 3, axis=0)
+        reached = often > 1e-6 * block.input.size  # No device moves the other walls.
+        inputs *= max([1.0, *np.abs([wall.gap for wall in walls])[reached] / often[reached]])
+    return inputs
 
 
 def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
@@ -193,40 +217,75 @@ def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
     return np.where(limits > limiter.limit, np.nextafter(limits, dtype(0)), limits)
 
 
-def _sequential(
-    system: Lti, inputs: Array, limiter: Limiter | None = None, dtype: type[np.floating] = np.float64
-) -> Array:
+def _sequential(system: Lti, inputs: Array, law: Law | None = None, dtype: type[np.floating] = np.float64) -> Array:
     """Return outputs (ticks, p) for inputs (ticks, m) from rest, with the order of sums in the exported file."""
     rows = np.block([[system.C, system.D], [system.A, system.B]]).astype(dtype)
-    z, outputs = np.zeros(system.order, dtype), []
-    limits = _limits(limiter, dtype) if limiter else None
-    table = _Balls.of(limiter, dtype) if limiter and limiter.balls else None
-    M = _box_matrix(limiter).astype(dtype) if limiter and not table else np.eye(0)
-    start = np.zeros(len(rows), dtype)
+    z, outputs, start = np.zeros(system.order, dtype), [], np.zeros(len(rows), dtype)
+    tick = _Tick.of(law, dtype) if law else None
     for u in inputs.astype(dtype):
         sums = _in_order([start, *(rows * np.concatenate([z, u])).T])
-        if limiter and limits is not None:
-            free = sums[limiter.sent_rows]
-            if limiter.balls or (np.abs(free) > limits).any():
-                e, f = _balled(table, free) if table else _boxed(M, limits, free)
-                sums = _in_order([sums, *(limiter.kick.astype(dtype) * e).T])
-                sums[limiter.sent_rows] = f
+        if tick:
+            sums = tick.bent(sums, z)
         outputs.append(sums[: system.outputs])
         z = sums[system.outputs :]
     return np.array(outputs)
 
 
-def _box_matrix(limiter: Limiter) -> Array:
-    """Return M of the box problem (m, m); if it is singular, a small diagonal (GROUNDED) is added."""
-    problem = limiter.problem
-    assert isinstance(problem, BoxProblem)
-    M = problem.M
-    return M if problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
+class _Tick(NamedTuple):
+    """What follows a tick's linear block: n unknowns e are solved from q (n,), and `kick` e is added to [f; z+]."""
+
+    sent: NDArray[np.intp]  # rows of the limited forces in [f; z+], the last entries of q
+    kick: Array  # (m + order, n)
+    problem: _Box | _Balls
+    gap: Array  # (w,) [m] of the walls, whose q are the first entries
+    steep: Array  # (w,) [N/m] a = K + B/T
+    memory: Array  # (w,) [N/m] B/T
+
+    @classmethod
+    def of(cls, law: Law, dtype: type[np.floating]) -> _Tick:
+        limiter, walls, T = law if isinstance(law, Limiter) else None, law.walls, law.sent.T
+        sent = limiter.sent_rows if limiter else np.empty(0, np.intp)
+        problem = _Balls.of(limiter, dtype) if limiter and limiter.balls else _Box.of(law, dtype)
+        rows = [wall.gap for wall in walls], law.steepness, [wall.damping / T for wall in walls]
+        kick = np.roll(law.uncut[1], len(walls), axis=1).astype(dtype)
+        return cls(sent, kick, problem, *(np.array(row, dtype) for row in rows))
+
+    def bent(self, sums: Array, z: Array) -> Array:
+        """Return [f; z+] from `sums`, the outputs of the linear block, by the operations of the C file."""
+        w = len(self.gap)
+        depth, box = slice(len(sums) - w, None), self.problem
+        sums[depth] -= self.gap
+        q = np.concatenate([self.steep * sums[depth] - self.memory * z[len(z) - w :], sums[self.sent]])
+        if isinstance(box, _Balls) or ((q > box.upper) | (q < box.lower)).any():
+            e, f = _balled(box, q) if isinstance(box, _Balls) else _boxed(box, q)
+            sums = _in_order([sums, *(self.kick * e).T])
+            sums[self.sent] = f[w:]
+        sums[depth] = np.where(sums[depth] < 0, 0, sums[depth])
+        return sums
 
 
-def _turns(m: int) -> int:
-    """Return the largest number of switches in a box problem: 3^m, which always suffices, but at most _MOST_TURNS."""
-    return min(3**m, _MOST_TURNS)
+class _Box(NamedTuple):
+    """The problem f = q - M e for forces within their limits and for walls, whose q is at most 0 without contact."""
+
+    M: Array  # (n, n)
+    lower: Array  # (n,) [N]
+    upper: Array  # (n,) [N]
+    weight: Array  # (n,) factors of e, which make it comparable with forces (BoxProblem.weight)
+
+    @classmethod
+    def of(cls, law: Law, dtype: type[np.floating]) -> _Box:
+        problem, w = law.problem, len(law.walls)
+        assert isinstance(problem, BoxProblem)
+        limits = _limits(law, dtype) if isinstance(law, Limiter) else np.empty(0, dtype)
+        share = _SINGLE_ROUNDING if dtype is np.float32 else GROUNDED
+        lower, upper = np.append(np.full(w, -np.finfo(dtype).max), -limits), np.append(np.zeros(w, dtype), limits)
+        M, weight = np.roll(problem.grounded(share), (w, w), (0, 1)), np.roll(problem.weight, w)
+        return cls(M.astype(dtype), lower, upper, weight.astype(dtype))
+
+
+def _turns(n: int) -> int:
+    """Return the largest number of switches in a box problem: 3^n, which always suffices, but at most _MOST_TURNS."""
+    return min(3**n, _MOST_TURNS)
 
 
 def _rounding(dtype: type[np.floating]) -> float:
@@ -253,25 +312,25 @@ def _solved(rows: Array, pivoting: bool) -> Array:
     return x
 
 
-def _boxed(M: Array, limit: Array, q: Array) -> tuple[Array, Array]:
-    """Solve f = q - M e (m,) for (e, f) by the operations of the C file, in their order and in the precision of q."""
-    m, real = len(q), q.dtype.type
-    zero, rounding, sign = real(0), real(_rounding(real)), np.zeros(m, real)
+def _boxed(box: _Box, q: Array) -> tuple[Array, Array]:
+    """Solve f = q - M e (n,) for (e, f) by the operations of the C file, in their order and in the precision of q."""
+    (M, lower, upper, weight), n, real = box, len(q), q.dtype.type
+    zero, rounding, sign = real(0), real(_rounding(real)), np.zeros(n, real)
     e = f = q
-    for _ in range(_turns(m)):
-        active = sign != 0
-        A = np.where(np.outer(active, active), M, np.eye(m, dtype=real))
-        v = _solved(np.column_stack([A, np.where(active, q - sign * limit, zero)]), pivoting=False)
+    for _ in range(_turns(n)):
+        active, at = sign != 0, np.where(sign < 0, lower, upper)
+        A = np.where(np.outer(active, active), M, np.eye(n, dtype=real))
+        v = _solved(np.column_stack([A, np.where(active, q - at, zero)]), pivoting=False)
         products = (M * v).T
         force = _in_order([q, *-products])
         tiny = _in_order([np.abs(q), *np.abs(products)]) * rounding
         e = np.where(sign * v > 0, v, zero)
-        f = np.where(active, sign * limit, np.clip(force, -limit, limit))
-        wrong = np.where(active, sign * v * np.diag(M) < -tiny, np.abs(force) > limit + tiny)
+        f = np.where(active, at, np.clip(force, lower, upper))
+        wrong = np.where(active, sign * v * weight < -tiny, (force > upper + tiny) | (force < lower - tiny))
         if not wrong.any():
             break
         first = np.argmax(wrong)
-        sign[first] = zero if active[first] else np.sign(force[first])
+        sign[first] = zero if active[first] else (1 if force[first] > upper[first] else -1)
     return e, f
 
 
@@ -375,8 +434,8 @@ _SOURCE_C = Template("""\
 /*
 $about
  *
- * One tick, if no force is limited:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that starts at 0.0
- * and adds the states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s
+ * One tick$unless:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that
+ * starts at 0.0 and adds the states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s
  * (FLT_EVAL_METHOD 0), without contraction of a*b + c and without -ffast-math, the code repeats Python's test vector to
  * the last bit:
  *
@@ -495,53 +554,60 @@ static ${real} ${name}_size(${real} a)
     return a < 0.0${f} ? -a : a;
 }
 """
-#: C code of the box problem, for ticks in which a force would exceed its limit
+#: C code of the box problem, for ticks in which a force would exceed its limit or a wall touches
 _LIMIT_DEFINED = """
 /* Solves f = q - M e with f within the limits; e is 0 or has the sign of the reached limit. Every turn switches the
- * first wrong limit. */
-static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
+ * first wrong limit, and eliminates among the forces at their limits. */
+static void ${name}_limit(const ${real} q[$unknowns], ${real} e[$unknowns], ${real} f[$unknowns])
 {
-    ${real} sign[${NAME}_CHANNELS] = {0.0${f}}, a[${NAME}_CHANNELS][${NAME}_CHANNELS], v[${NAME}_CHANNELS];
-    int turn, wrong, i, j, k;
+    ${real} a[$unknowns][$unknowns], v[$unknowns];
+    signed char sign[$unknowns] = {0};
+    long turn;
+    int wrong, i, j, k;
     for (turn = 0; turn < $turns; turn++) {
-        for (i = 0; i < ${NAME}_CHANNELS; i++) {
-            for (j = 0; j < ${NAME}_CHANNELS; j++)
-                a[i][j] = sign[i] != 0.0${f} && sign[j] != 0.0${f} ? ${name}_M[i][j] : (i == j ? 1.0${f} : 0.0${f});
-            v[i] = sign[i] != 0.0${f} ? q[i] - sign[i] * ${name}_LIMIT[0][i] : 0.0${f};
+        for (i = 0; i < $unknowns; i++) {
+            for (j = 0; j < $unknowns; j++)
+                a[i][j] = ${name}_M[i][j];
+            v[i] = sign[i] ? q[i] - ${name}_BOUND[sign[i] > 0][i] : 0.0${f};
         }
-        for (k = 0; k < ${NAME}_CHANNELS; k++)
-            for (i = k + 1; i < ${NAME}_CHANNELS; i++) {
-                ${real} ratio = a[i][k] / a[k][k];
-                for (j = k + 1; j < ${NAME}_CHANNELS; j++)
-                    a[i][j] -= ratio * a[k][j];
-                v[i] -= ratio * v[k];
-            }
-        for (i = ${NAME}_CHANNELS - 1; i >= 0; i--) {
-            for (j = i + 1; j < ${NAME}_CHANNELS; j++)
-                v[i] -= a[i][j] * v[j];
+        for (k = 0; k < $unknowns; k++)
+            for (i = k + 1; i < $unknowns; i++)
+                if (sign[k] && sign[i]) {
+                    ${real} ratio = a[i][k] / a[k][k];
+                    for (j = k + 1; j < $unknowns; j++)
+                        a[i][j] -= ratio * a[k][j];
+                    v[i] -= ratio * v[k];
+                }
+        for (i = $unknowns - 1; i >= 0; i--) {
+            if (!sign[i])
+                continue;
+            for (j = i + 1; j < $unknowns; j++)
+                if (sign[j])
+                    v[i] -= a[i][j] * v[j];
             v[i] /= a[i][i];
         }
         wrong = 0;
-        for (i = 0; i < ${NAME}_CHANNELS; i++) {
-            ${real} limit = ${name}_LIMIT[0][i], sum = q[i], size = ${name}_size(q[i]), tiny;
-            for (j = 0; j < ${NAME}_CHANNELS; j++) {
-                sum -= ${name}_M[i][j] * v[j];
-                size += ${name}_size(${name}_M[i][j] * v[j]);
-            }
+        for (i = 0; i < $unknowns; i++) {
+            ${real} lower = ${name}_BOUND[0][i], upper = ${name}_BOUND[1][i];
+            ${real} sum = q[i], size = ${name}_size(q[i]), along = sign[i] < 0 ? -v[i] : v[i], tiny;
+            for (j = 0; j < $unknowns; j++)
+                if (sign[j]) {
+                    ${real} product = ${name}_M[i][j] * v[j];
+                    sum -= product;
+                    size += ${name}_size(product);
+                }
             tiny = size * $rounding;
-            e[i] = sign[i] * v[i] > 0.0${f} ? v[i] : 0.0${f};
-            f[i] = sum > limit ? limit : (sum < -limit ? -limit : sum);
-            if (sign[i] != 0.0${f})
-                f[i] = sign[i] * limit;
+            e[i] = along > 0.0${f} ? v[i] : 0.0${f};
+            f[i] = sign[i] ? ${name}_BOUND[sign[i] > 0][i] : sum > upper ? upper : sum < lower ? lower : sum;
             if (wrong)
                 continue;
             wrong = 1;
-            if (sign[i] == 0.0${f} && sum > limit + tiny)
-                sign[i] = 1.0${f};
-            else if (sign[i] == 0.0${f} && sum < -limit - tiny)
-                sign[i] = -1.0${f};
-            else if (sign[i] != 0.0${f} && sign[i] * v[i] * ${name}_M[i][i] < -tiny)
-                sign[i] = 0.0${f};
+            if (!sign[i] && sum > upper + tiny)
+                sign[i] = 1;
+            else if (!sign[i] && sum < lower - tiny)
+                sign[i] = -1;
+            else if (sign[i] && along * ${name}_BOUND[2][i] < -tiny)
+                sign[i] = 0;
             else
                 wrong = 0;
         }
@@ -689,26 +755,44 @@ static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CH
 }
 """
 _LIMITED = """    {
-        ${real} q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
+        ${real} q[$unknowns], e[$unknowns], f[$unknowns];
         int more = $always;
-        for (i = 0; i < ${NAME}_CHANNELS; i++) {
-            q[i] = ${name}_SENT[i] < ${NAME}_CHANNELS ? out[${name}_SENT[i]] : next[${name}_SENT[i] - ${NAME}_CHANNELS];
-$reached        }
-        if (more) {
+$asked$pushed$reached        if (more) {
             $limit;
-            for (j = 0; j < ${NAME}_CHANNELS; j++) {
+            for (j = 0; j < $unknowns; j++) {
+                if (e[j] == 0.0${f})
+                    continue;
                 for (i = 0; i < ${NAME}_CHANNELS; i++)
                     out[i] += ${name}_KICK[i][j] * e[j];
                 for (i = 0; i < ${NAME}_STATES; i++)
                     next[i] += ${name}_KICK[${NAME}_CHANNELS + i][j] * e[j];
             }
-            for (i = 0; i < ${NAME}_CHANNELS; i++)
+$sent        }
+$apart    }
+"""
+#: C code of force limits
+_ASKED = """        for (i = 0; i < ${NAME}_CHANNELS; i++)
+            q[$walls + i] = ${name}_SENT[i] < ${NAME}_CHANNELS ? out[${name}_SENT[i]]
+                                                             : next[${name}_SENT[i] - ${NAME}_CHANNELS];
+"""
+_SENT = """            for (i = 0; i < ${NAME}_CHANNELS; i++)
                 if (${name}_SENT[i] < ${NAME}_CHANNELS)
-                    out[${name}_SENT[i]] = f[i];
+                    out[${name}_SENT[i]] = f[$walls + i];
                 else
-                    next[${name}_SENT[i] - ${NAME}_CHANNELS] = f[i];
+                    next[${name}_SENT[i] - ${NAME}_CHANNELS] = f[$walls + i];
+"""
+#: C code of walls: the last states are the depths in them, which are computed from the displacements across them
+_PUSHED = """        for (i = 0; i < $walls; i++) {
+            j = ${NAME}_STATES - $walls + i;
+            next[j] -= ${name}_WALL[0][i];
+            q[i] = ${name}_WALL[1][i] * next[j] - ${name}_WALL[2][i] * state->z[j];
         }
-    }
+"""
+_APART = """        for (i = ${NAME}_STATES - $walls; i < ${NAME}_STATES; i++)
+            next[i] = next[i] < 0.0${f} ? 0.0${f} : next[i];
+"""
+_REACHED = """        for (i = 0; i < $unknowns; i++)
+            more |= q[i] < ${name}_BOUND[0][i] || q[i] > ${name}_BOUND[1][i];
 """
 
 
@@ -725,6 +809,7 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
         "input": block.input.what,
         "output": block.output.what,
         "m": system.inputs,
+        "unless": (" without contact" if block.law and block.law.walls else "") + ", if no force is limited",
         "n": system.order,
         "T": repr(system.T),
         "real": "float" if block.single else "double",
@@ -743,36 +828,44 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     }
     for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
         words[word] = ""
-    if block.limiter:
-        _add_limiter(words, block, block.limiter)
+    if block.law:
+        _add_inequalities(words, block, block.law)
     for word, text in (("more_declared", _FREE_DECLARED), ("more_defined", _FREE_DEFINED)):
         words[word] = Template(text).substitute(words) if name == "coupling" else ""
     return _SOURCE_C.substitute(words)
 
 
-def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) -> None:
-    """Add the C code of the limiter and its tables to `words`."""
-    name, dtype = block.name, block.dtype
-    integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
-    if limiter.balls:
-        balls, defined = _Balls.of(limiter, dtype), _BALLS_DEFINED
-        tables = {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
+def _add_inequalities(words: dict[str, Any], block: ExportedBlock, law: Law) -> None:
+    """Add the C code of limiter and walls and their tables to `words`."""
+    name, tick, w = block.name, _Tick.of(law, block.dtype), len(law.walls)
+    integers, tables, defined = {}, {}, _LIMIT_DEFINED
+    words |= {"walls": w, "unknowns": tick.kick.shape[1]}
+    if isinstance(tick.problem, _Balls):
+        balls, defined = tick.problem, _BALLS_DEFINED
+        tables |= {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
         integers |= {"AT": balls.at, "FIRST": balls.first, "LAST": balls.last, "END": balls.end}
         words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
-        words |= {"residual": _RESIDUAL.hex() + words["f"], "rounding": _ball_rounding(dtype).hex() + words["f"]}
-        words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
+        words |= {"residual": _RESIDUAL.hex() + words["f"], "rounding": _ball_rounding(block.dtype).hex() + words["f"]}
+        words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n"}
         words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
         words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
     else:
-        tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
-        words |= {"turns": str(_turns(block.system.inputs)), "rounding": _rounding(dtype).hex() + words["f"]}
-        reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
-        words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
-    for of, rows in {**tables, "KICK": limiter.kick}.items():
-        words["tables"] += "\n\n" + _table("static const", f"{name}_{of}", np.asarray(rows), dtype)
+        tables |= {"BOUND": tick.problem[1:], "M": tick.problem.M}
+        words |= {"turns": str(_turns(words["unknowns"])), "rounding": _rounding(block.dtype).hex() + words["f"]}
+        words |= {"always": "0", "limit": f"{name}_limit(q, e, f)"}
+    if block.limiter:
+        integers["SENT"] = tick.sent
+    if w:
+        tables["WALL"] = [tick.gap, tick.steep, tick.memory]
+    for of, rows in {**tables, "KICK": tick.kick}.items():
+        words["tables"] += "\n\n" + _table("static const", f"{name}_{of}", np.asarray(rows), block.dtype)
     for of, values in integers.items():
         row = ", ".join(map(str, values))
         words["tables"] += f"\n\nstatic const int {name}_{of}[{len(values)}] = {{{row}}};"
+    parts = {"asked": (_ASKED, block.limiter), "sent": (_SENT, block.limiter), "pushed": (_PUSHED, w)}
+    parts |= {"apart": (_APART, w), "reached": (_REACHED, isinstance(tick.problem, _Box))}
+    for part, (text, present) in parts.items():
+        words[part] = Template(text).substitute(words) if present else ""
     words["limit_defined"] = Template(_SIZE_DEFINED + defined).substitute(words)
     words["limited"] = Template(_LIMITED).substitute(words)
 
@@ -799,7 +892,7 @@ def with_origin(
 ) -> ExportedBlock:
     """Add comment lines on the coupling's `file` and on its proof; `claim` is a further line."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
-    proved = _guarantee(stored, verdict, block.limiter is not None)
+    proved = _guarantee(stored, verdict, block.limiter)
     return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))
 
 
@@ -810,7 +903,7 @@ def _gains(stored: Stored) -> str:
     return f"coupling of kind {stored.coupling.__struct_config__.tag}"
 
 
-def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
+def _guarantee(stored: Stored, verdict: Verdict, limiter: Limiter | None) -> str:
     claim = stored.certificate
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
@@ -819,6 +912,12 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     if claim.guarantee == RANGES and stored.loop.ranges:
         where = where_proved(stored.loop.network, stored.loop.ranges)
         how += f"; proved at {where} only: design.check searches between them"
-    forces = "also while forces are limited" if limited else "only while forces stay below their limits"
+    forces = "only while forces stay below their limits"
+    if limiter:
+        forces = f"also while forces are limited to {listed(limiter.limit.tolist())} N"
     only = "; ".join((*covered(stored.loop, claim), forces, "encoder steps are not covered"))
-    return f"Certified for {claim.guarantee} ({how}): {needs}; {only}."
+    where = claim.guarantee
+    if stored.loop.environment.walls and where in (ANY, HERE):
+        where = f"{ANY}, with or without walls" if where == ANY else MAKING
+    theta = ", ".join(map(str, stored.loop.theta))
+    return f"Certified for theta = {theta} and {where} ({how}): {needs}; {only}."

@@ -104,6 +104,19 @@ def test_a_limited_spring_equals_calculations_by_hand():
     assert (np.abs(f) <= 1).all()
 
 
+@pytest.mark.parametrize("third", [False, True])
+def test_a_device_between_walls_is_limited_to_the_right_side(third):
+    """Without contact a slip changes no force, so its own entry in M is 0; with three walls the tick pivots."""
+    walls = (Wall(("a", GROUND), 1000.0, 0.0, 1e-3), Wall((GROUND, "a"), 3000.0, 0.0, 2e-3))
+    far = Wall(("a", "far"), 500.0, 0.0, 0.05)
+    springs, masses = ((Spring(("far", GROUND), 100.0),), {"far": 0.1}) if third else ((), {})
+    network = Network(("a",), springs, masses, walls=(*walls, *(far,) * third))
+    x = 0.004 * np.random.default_rng(0).normal(size=(200, 1, 1))
+    f = drive(closed(loop_of(network, (0,), (0,)).law(NoCoupling(), (2.0,), (0.0,))), x).f[:200]
+    expected = np.clip(1000 * np.maximum(x - 1e-3, 0) - 3000 * np.maximum(-x - 2e-3, 0), -2, 2)
+    np.testing.assert_allclose(f, expected, rtol=0, atol=1e-12)
+
+
 def test_with_rho_a_limited_spring_can_give_energy():
     """With rho = 0.05 this cycle gives 0.0051 J per turn beyond the damping's dx^2/2; with rho = 0 it gives none."""
     x = np.tile([-1.048, -0.998, 1.028, 1.049, 1.069, 0.996], 20)

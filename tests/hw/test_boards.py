@@ -155,7 +155,7 @@ def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
     counts, told, state = paddle(folder, 1900, swing)
     start = int(np.argmax(told[:, 0] > 10_000))  # the coupling's first tick takes longer than those of the motor test
     x = PER_COUNT * (counts - counts[5]).astype(f32) + HOME
-    f = _sequential(block.system, (x[start:] - x[start])[:, None], block.limiter, f32)[:, 0]
+    f = _sequential(block.system, (x[start:] - x[start])[:, None], block.law, f32)[:, 0]
     gain = np.minimum(np.cumsum(np.full(len(f), f32(1.25e-3) / f32(0.25)), dtype=f32), f32(1))
     force = np.clip(-gain * f, f32(-4.8), f32(4.8))
     duty = np.minimum(np.abs(force) * DUTY + f32(0.5), f32(255)).astype(int)
@@ -246,7 +246,7 @@ def test_the_teensys_forces_are_those_of_python(teensy):
     x = 10e-6 * (np.array(counts) - counts[3])
     candidates = []
     for begin in range(start - 2, start + 3):  # the board does not report the coupling's first tick: try five
-        f = _sequential(block.system, x[begin:] - x[begin], block.limiter)
+        f = _sequential(block.system, x[begin:] - x[begin], block.law)
         gain = np.minimum(np.cumsum(np.full(len(f), 1.2e-3 / np.float32(0.25))), 1.0)[:, None]
         steps = np.round(np.clip(-gain * f, -8, 8) / 12 * 4095).astype(int)
         candidates.append(np.abs(pins[begin + 1 :, :, 0] * (1 - 2 * pins[begin + 1 :, :, 1]) - steps[:-1]).max())
