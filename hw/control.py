@@ -342,7 +342,8 @@ class Drive:
         self._check_motion(positions, 1e-6 * lasted)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
-        if self.gain > 0:  # otherwise only test forces act
+        # Before the gain rises only test forces act. A chirp also moves a handle by less than a count.
+        if self.gain > 0 and not self._identifies:
             self.encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)

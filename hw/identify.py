@@ -183,8 +183,10 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
     Raises ValueError where the device did not move, a hand holds it, the bound of its damping is 0, or its damping
     falls with speed or frequency.
     """
-    if np.ptp(x) < 20 * step:
-        raise ValueError(f"the axis moved by {np.ptp(x) / step:.0f} encoder steps, at least 20 are needed")
+    # The last third has a slow sweep, so that it shows an encoder or motor that has died.
+    for when, part, least in (("", x, 20), (" in the last third of the record", x[2 * len(x) // 3 :], 5)):
+        if (steps := np.ptp(part) / step) < least:
+            raise ValueError(f"the axis moved by {steps:.0f} encoder steps{when}, at least {least} are needed")
     hand = lever * x, force / lever, T
     found = friction(*hand, lever * step)
     law, allowed = at_radius(found, lever), _SPRUNG * lever**2

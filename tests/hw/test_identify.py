@@ -648,3 +648,22 @@ def test_declared_limits_stay_in_the_table(kind):
     read = msgspec.convert(tomllib.loads(_table(device, [axis, axis], None))["device"][0], kind)
     for name in ("force_limit", "encoder_step", "friction_max", *more):
         assert getattr(read, name) == getattr(device, name)
+
+
+def test_chirps_below_a_count_are_no_dead_encoder():
+    """At 200 Hz, 1 N moves 0.25 kg by 2.5 um, a quarter of an Omega's count. Forces do not depend on the encoder."""
+    scenario = load("omega-pair-rigid")
+    device = msgspec.structs.replace(scenario.device[0], encoder_step=1e-5)
+    scenario = nobody(scenario.replace(device=(device, device)))
+    session = Session(scenario, SafetyLimits((1.3, 1.3)), LinkSettings(measure=60, held=False, identifies=True))
+    excitation = chirp(2, scenario.T, 1, 1.0, (3.0, 200.0), 1.5)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: [excitation], keep=False)
+    rehearsal.run_until_armed(3.0)
+    assert session.stage == Stage.ARMED
+
+
+def test_an_encoder_that_dies_gives_no_bound():
+    x = np.sin(np.arange(3000) / 50.0)
+    x[1900:] = x[1900]
+    with pytest.raises(ValueError, match="0 encoder steps in the last third of the record, at least 5"):
+        identify(x, np.ones(3000), 1e-3, STEP, rigid=True)
