@@ -29,9 +29,16 @@ int harness_init(hl_device *d, const char *firmware, uint32_t serial, uint32_t p
     return hl_init(d, &info);
 }
 
-void harness_receive(hl_device *d, const uint8_t *data, size_t n, uint32_t now)
+/* Sets the motors when hl_receive asks for it, and returns how often it asked. */
+int harness_receive(hl_device *d, const uint8_t *data, size_t n, uint32_t now, int16_t *motors)
 {
-    while (n--) hl_receive(d, *data++, now);
+    int count = 0;
+    while (n--)
+        if (hl_receive(d, *data++, now)) {
+            memcpy(motors, d->applied, d->info.axes * sizeof *motors);
+            count++;
+        }
+    return count;
 }
 
 size_t harness_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *force, uint8_t *out)
@@ -43,6 +50,11 @@ void harness_estop(hl_device *d) { hl_estop(d); }
 void harness_fault(hl_device *d) { hl_fault(d); }
 void harness_number(hl_device *d, uint32_t tick) { d->k = (uint16_t)tick; }
 void harness_deadman(hl_device *d, int held) { hl_deadman(d, held != 0); }
+
+int harness_look(const hl_device *d, int what)
+{
+    return what == 0 ? d->phase : what == 1 ? d->cause : what == 2 ? d->k : d->misses;
+}
 
 #ifdef HARNESS_MAIN
 static uint32_t word(void)
@@ -56,10 +68,12 @@ static uint32_t word(void)
  * n (16 bits), n bytes, a force (16 bits) per axis */
 int main(void)
 {
-    uint32_t values[5 * HL_MAX_AXES], serial = word(), period_ns = word(), axes = word(), a;
+    uint32_t values[5 * 9], serial = word(), period_ns = word(), axes = word(), a; /* 9: one axis too many */
     hl_device *d = (hl_device *)malloc(sizeof *d);
+    int16_t *force = (int16_t *)malloc(axes * sizeof *force);
     for (a = 0; a < 5 * axes; a++) values[a] = word();
-    if (!d || !harness_init(d, "harness", serial, period_ns, (int)axes, values)) return 1;
+    if (!d || !force) return 1;
+    if (harness_init(d, "harness", serial, period_ns, (int)axes, values) != (axes <= HL_MAX_AXES)) return 1;
     for (;;) {
         uint32_t operation = word();
         if (operation == 'E') harness_estop(d);
@@ -70,15 +84,14 @@ int main(void)
             uint32_t now = word(), n = word();
             uint8_t *data = (uint8_t *)malloc(n ? n : 1); /* n bytes exactly, so that the sanitizer finds an access beyond them */
             if (!data || fread(data, 1, n, stdin) != n) return 1;
-            harness_receive(d, data, n, now);
+            harness_receive(d, data, n, now, force);
             free(data);
         } else if (operation == 'T') {
             uint32_t now = word();
             int32_t *counts = (int32_t *)malloc(axes * sizeof *counts);
-            int16_t *force = (int16_t *)malloc(axes * sizeof *force);
             uint8_t *out = (uint8_t *)malloc(HL_MAX_OUT), head[2];
             size_t n;
-            if (!counts || !force || !out) return 1;
+            if (!counts || !out) return 1;
             for (a = 0; a < axes; a++) counts[a] = (int32_t)word();
             n = harness_tick(d, now, counts, force, out);
             hl_put16(head, (uint16_t)n);
@@ -89,7 +102,6 @@ int main(void)
                 fwrite(head, 1, 2, stdout);
             }
             free(counts);
-            free(force);
             free(out);
         } else return 1;
     }

@@ -1,12 +1,29 @@
-"""Provide, once per test run, the scenario of the sessions and couplings that are certified for its links."""
+"""Provide both implementations of a device, the scenario of the sessions, and couplings certified for its links."""
 
 from dataclasses import replace
 
 import pytest
 
 from haptic_loop.hw.control import CouplingRequest, certified_couplings
+from haptic_loop.hw.device_state import Device
 from haptic_loop.sim.scenario import load as scenario_of
 from tests.checks.faults import CASES, LATE, _lively, _prepared
+from tests.compiled_device import Firmware, compiled, needs_gcc
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory):
+    """Return the compiled firmware."""
+    return compiled(tmp_path_factory.mktemp("firmware"))
+
+
+@pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
+def machine(request):
+    """Return a function that makes a device of an Info, in Python or in C."""
+    if request.param == "python":
+        return Device
+    library = request.getfixturevalue("library")
+    return lambda about: Firmware(library, about)
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,13 @@
-"""The device follows docs/protocol.md: when forces act, what stops them, and what cannot start them again."""
+"""The device follows docs/protocol.md: when forces act, what stops them, and what cannot start them again.
+
+The tests run on hw/device_state.py and on the compiled haptic_link.h.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.protocol import (
     NO_MARGIN,
     Ack,
@@ -19,28 +24,36 @@ from haptic_loop.hw.protocol import (
     State,
     Stop,
     config_crc,
-    encode,
+    pack,
 )
+from tests.compiled_device import enclosed, framed
 
 T = 1200  # [us]
-INFO = Info(1, "test", 7, 1_200_000, (1_370_000,) * 2, (10_000_000,) * 2, (500,) * 2, (24_000, 20_000), (8_000,) * 2)
+INFO = Info(2, "test", 7, 1_200_000, (1_370_000,) * 2, (10_000_000,) * 2, (500,) * 2, (24_000, 20_000), (8_000,) * 2)
 CONFIG = Config(1, 4, 4, 0, (24_000, 20_000), (48_000,) * 2)
 
 
-class Rig:
-    """A device, and a host that sends only what a test tells it to send."""
+@pytest.fixture(autouse=True)
+def _both_machines(machine, monkeypatch):
+    monkeypatch.setattr(Rig, "machine", staticmethod(machine), raising=False)
 
-    def __init__(self, config: Config | None = CONFIG, first_tick: int = 0) -> None:
-        self.device, self.decoder, self.now = Device(INFO), Decoder(), 0
+
+class Rig:
+    """A device in Python or C, and a host that sends only what a test tells it to send."""
+
+    machine: Callable[[Info], Any]
+
+    def __init__(self, config: Config | None = CONFIG, first_tick: int = 0, info: Info = INFO, now: int = 0) -> None:
+        self.device, self.decoder, self.now = self.machine(info), Decoder(), now
         self.device.k = first_tick
         if config:
-            self.device.receive(encode(config), self.now)
+            self.say(config)
             assert [type(m) for m in self.tick()] == [Ack, State]
         self.config = config
 
     def say(self, *messages, after: int = 300) -> None:
         for message in messages:
-            self.device.receive(encode(message), self.now + after)
+            self.device.receive(framed(message), self.now + after)
 
     def answer(self, force=(0, 0), command=Command.RUN, back: int = 0, after: int = 300) -> None:
         """Send the FORCE that answers the STATE of `back` ticks ago."""
@@ -58,7 +71,7 @@ class Rig:
         return self.said
 
     def arm(self) -> None:
-        for _ in range(self.config.theta):
+        for _ in range(self.config.due):
             self.answer(command=Command.ARM)
             self.tick()
         assert self.device.phase == Phase.ARMED
@@ -93,9 +106,15 @@ def test_unconfigured_devices_answer_hello_and_config_only():
     ("config", "reason"),
     [
         (Config(1, 4, 4, 0, (1,), (1,)), Refused.AXES),
+        (Config(1, 4, 4, 0, (1, 1, 1), (1, 1, 1)), Refused.AXES),
+        (CONFIG._replace(theta=16), Refused.THETA),
+        (CONFIG._replace(ramp=0), Refused.RELEASE),
         (CONFIG._replace(hold=4, ramp=13), Refused.RELEASE),  # 17 ticks of 1.2 ms are 20.4 ms, above 20 ms
         (CONFIG._replace(cap=(24_001, 1)), Refused.CAP),
         (CONFIG._replace(cap=(1, 20_001)), Refused.CAP),
+        (CONFIG._replace(cap=(1, 0)), Refused.CAP),
+        (CONFIG._replace(cap=(1, 0), slew=(0, 1)), Refused.CAP),  # CAP, which is 6, comes before SLEW
+        (CONFIG._replace(slew=(1, 0)), Refused.SLEW),
     ],
 )
 def test_unsuitable_configs_are_refused(config, reason):
@@ -103,19 +122,40 @@ def test_unsuitable_configs_are_refused(config, reason):
     rig.say(config)
     assert rig.tick() == [Ack(config_crc(config), reason)]
     assert rig.device.phase == Phase.SILENT
-    rig.say(config._replace(hold=4, ramp=12, cap=(24_000, 20_000), slew=(1, 1)))
+    rig.say(Config(15, 4, 12, 0, (24_000, 20_000), (1, 65_535)))
     assert rig.tick()[0].refused == Refused.ACCEPTED
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "hold", "ramp", "refused"),
+    [
+        (2_000_000, 4, 6, Refused.ACCEPTED),
+        (2_000_000, 4, 7, Refused.RELEASE),
+        (10_000_000, 215, 215, Refused.RELEASE),  # 4.3 s, or 5 ms modulo 2^32 ns
+        (10_000_000, 255, 255, Refused.RELEASE),
+    ],
+)
+def test_release_takes_at_most_20_ms(period_ns, hold, ramp, refused):
+    rig = Rig(config=None, info=INFO._replace(period_ns=period_ns))
+    rig.say(CONFIG._replace(hold=hold, ramp=ramp))
+    assert rig.tick()[0].refused == refused
+
+
+@pytest.mark.parametrize("name", ["", "sixteen letters!"])
+def test_info_has_all_letters_of_the_name(name):
+    rig = Rig(config=None, info=INFO._replace(firmware=name))
+    rig.say(Hello())
+    assert rig.tick() == [INFO._replace(firmware=name)]
 
 
 def test_configs_are_refused_while_forces_act():
     rig = armed()
-    other = CONFIG._replace(theta=3)
+    other = CONFIG._replace(theta=3, hold=9, ramp=1)
     for phase in (Phase.ARMED, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.RAMP, Phase.RAMP):
         assert rig.device.phase == phase
         rig.say(other)
         ack, _ = rig.tick()
         assert ack == Ack(config_crc(other), Refused.RUNNING)
-    assert rig.device.config == CONFIG
 
 
 def test_info_waits_until_the_motors_rest():
@@ -141,6 +181,15 @@ def test_forces_act_only_after_arming():
     rig.tick()
     assert (rig.device.phase, rig.state.crc_errors) == (Phase.DISARMED, 1)
     rig.arm()
+
+
+def test_configs_forget_the_forces_that_wait():
+    rig = Rig(CONFIG._replace(theta=3))
+    rig.answer(command=Command.ARM)
+    rig.say(rig.config)
+    for _ in range(4):
+        rig.tick()
+        assert rig.at == (Phase.DISARMED, Cause.NONE)
 
 
 # ---- the latch -------------------------------------------------------------------------------------------------------
@@ -182,6 +231,29 @@ def test_late_early_and_misaddressed_frames_are_not_used():
     rig.tick()
     assert (rig.forces, rig.device.phase) == ((100, 100), Phase.HOLDING)
     assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this tick and that of the CONFIG had no answer
+
+
+@pytest.mark.parametrize("theta", [0, 1, 3])
+def test_forces_for_later_samples_are_not_used(theta):
+    rig = armed(theta=theta)
+    rig.answer((900, 900), back=-1)
+    for _ in range(theta + 2):
+        rig.tick()
+        assert (rig.forces, rig.state.margin_us) == ((0, 0), NO_MARGIN)
+
+
+def test_a_late_force_keeps_the_force_that_waits():
+    """The places for forces repeat after 16 ticks. A late FORCE sets echo and margin although its place is taken."""
+    rig = armed(theta=15)
+    k = rig.device.k
+    rig.answer((100, -100))
+    rig.answer((900, 900), back=16)
+    for _ in range(15):
+        rig.tick()
+        if rig.device.k == k + 1:
+            assert (rig.state.echo, rig.state.margin_us) == ((k - 16) & 0xFFFF, -T - 300)
+        rig.answer()
+    assert (rig.at, rig.forces) == ((Phase.ARMED, Cause.NONE), (100, -100))
 
 
 def test_theta_zero_forces_act_on_arrival():
@@ -244,6 +316,9 @@ def test_with_theta_zero_idle_ramps_at_once():
     assert (rig.at, rig.device.applied) == ((Phase.RAMP, Cause.COMMAND), (100, 100))
     rig.tick()
     assert rig.forces == (50, 50)
+    rig.tick()
+    rig.answer(command=Command.ARM)  # arms only after a new CONFIG
+    assert rig.at == (Phase.STOPPED, Cause.COMMAND)
 
 
 def test_the_margin_is_time_before_the_latch():
@@ -255,11 +330,14 @@ def test_the_margin_is_time_before_the_latch():
         assert (rig.state.echo, rig.state.margin_us) == (k, margin)
         rig.tick()
         assert (rig.state.echo, rig.state.margin_us) == (k, NO_MARGIN)
-    slow = Device(INFO._replace(period_ns=3_000_000))
-    slow.receive(encode(CONFIG._replace(theta=15, hold=2)), 0)
-    slow.tick(3000, (0, 0))
-    slow.receive(encode(Force(Command.IDLE, 16, 1, (0, 0))), 3000)
-    assert slow.margin == 32_767  # the margin is 45,000 us, but the wire carries at most 32,767
+    slow = Rig(CONFIG._replace(theta=15, hold=2), info=INFO._replace(period_ns=3_000_000))
+    slow.answer(command=Command.IDLE, after=0)
+    slow.tick()
+    assert slow.state.margin_us == 32_767  # the margin is 45,000 us, but the wire carries at most 32,767
+    late = Rig(now=2**32 - T - 200)
+    late.answer(command=Command.IDLE, after=300)  # the clock wraps 200 us after the tick
+    late.tick()
+    assert (late.state.margin_us, late.state.t_us) == (900, T - 200)
     rig = Rig()
     rig.tick()
     rig.answer(command=Command.IDLE, back=1, after=100)  # the tick of this FORCE began 100 us ago
@@ -404,14 +482,29 @@ def test_cap_and_slew_hold_per_axis():
     assert [f for _, f in seen] == [-2000] * 6 + [500] + [2000] * 5
 
 
-def test_the_cap_grows_from_zero_after_arming():
+def test_the_cap_grows_from_zero_after_each_arming():
     rig = armed(ramp_in=5, cap=(1000, 500))
-    seen = []
-    for _ in range(7):
+    for _ in range(2):
+        seen = []
+        for _ in range(7):
+            rig.answer((20_000, -20_000))
+            rig.tick()
+            seen.append(rig.forces)
+        assert seen == [(200, -100), (400, -200), (600, -300), (800, -400), (1000, -500), (1000, -500), (1000, -500)]
+        rig.say(Stop(Reason.DONE))
+        assert [rig.tick() and rig.device.phase for _ in range(4)][-1] == Phase.STOPPED
+        rig.say(rig.config)
+        rig.tick()
+        rig.arm()
+
+
+def test_the_growing_cap_is_rounded_down():
+    rig = armed(ramp_in=300, cap=(1000, 500))
+    for k in range(1, 310):
         rig.answer((20_000, -20_000))
         rig.tick()
-        seen.append(rig.forces)
-    assert seen == [(200, -100), (400, -200), (600, -300), (800, -400), (1000, -500), (1000, -500), (1000, -500)]
+        run = min(k, 300)
+        assert rig.forces == (1000 * run // 300, -(500 * run // 300))
 
 
 def test_counters_wrap():
@@ -425,11 +518,32 @@ def test_counters_wrap():
 def test_frames_of_wrong_kinds_are_not_obeyed():
     rig = armed()
     k = rig.device.k
-    rig.say(Force(Command.RUN, k + 1, k, (900,)), Force(9, k + 1, k, (0, 0)), Ack(1, 0), INFO, rig.state)
+    wrong = [
+        (Command.RUN, (900,)),
+        (Command.RUN, (900, 900, 900)),
+        (9, (0, 0)),
+        (Command.IDLE, (1, 0)),
+        (Command.ARM, (0, 1)),
+    ]
+    rig.say(*[Force(command, k + 1, k, force) for command, force in wrong], Ack(1, 0), INFO, rig.state)
     rig.tick()
-    assert (rig.state.crc_errors, rig.forces, rig.device.phase) == (5, (0, 0), Phase.HOLDING)
+    assert (rig.state.crc_errors, rig.forces, rig.device.phase) == (8, (0, 0), Phase.HOLDING)
 
 
-def test_an_info_out_of_range_is_refused():
-    with pytest.raises(ValueError, match=r"Info.period_ns: 1; 100000 to 100000000"):
-        Device(INFO._replace(period_ns=1))
+@pytest.mark.parametrize(
+    "payload",
+    [
+        pack(Hello()) + b"\0",
+        pack(CONFIG)[:6],
+        pack(CONFIG) + b"\0",
+        pack(Force(Command.ARM, 2, 1, (0, 0))) + b"\0",
+        pack(Stop(Reason.DONE)) + b"\0",
+        pack(Stop(Reason.DONE))[:1],
+    ],
+    ids=bytes.hex,
+)
+def test_messages_of_wrong_lengths_only_count(payload):
+    rig = Rig()
+    rig.device.receive(enclosed(payload), rig.now)
+    (state,) = rig.tick()
+    assert (rig.at, state.crc_errors) == ((Phase.DISARMED, Cause.NONE), 1)

@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 from pathlib import Path
-from zlib import crc32
 
 import pytest
 
@@ -30,32 +29,13 @@ from haptic_loop.hw.protocol import (
     State,
     Stop,
     encode,
-    pack,
 )
+from tests.compiled_device import GCC, HARNESS, HEADER, STRICT, Firmware, build, enclosed, framed, needs_gcc
 
-ROOT = Path(__file__).parent.parent.parent
-HEADER, HARNESS = ROOT / "hw/firmware", ROOT / "tests/firmware"
-STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror"]
-GCC, GXX = shutil.which("gcc"), shutil.which("g++")
-needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_link.h is not compiled here")
+GXX = shutil.which("g++")
 needs_gxx = pytest.mark.skipif(GXX is None, reason="g++ is not installed: example.ino is not compiled here")
 
-SERIAL, MAX_OUT = 77, 1024
-
-
-def build(*arguments: str | Path) -> None:
-    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    path = tmp_path_factory.mktemp("firmware") / "harness.so"
-    build(GCC, "-std=c99", "-O2", *STRICT, "-fPIC", "-shared", f"-I{HEADER}", HARNESS / "harness.c", "-o", path)
-    lib = ctypes.CDLL(str(path))
-    lib.harness_size.restype = lib.harness_tick.restype = ctypes.c_size_t
-    lib.harness_receive.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_uint32]
-    return lib
+SERIAL = 77
 
 
 def info(axes: int, period_ns: int = 1_200_000) -> Info:
@@ -71,44 +51,6 @@ def info(axes: int, period_ns: int = 1_200_000) -> Info:
         limits,
         (8000,) * axes,
     )
-
-
-class Firmware:
-    """The C firmware with the interface of hw.device_state.Device."""
-
-    def __init__(self, library, about: Info) -> None:
-        self.lib, self.axes = library, about.axes
-        self.memory = ctypes.create_string_buffer(library.harness_size())
-        self.counts, self.force = (ctypes.c_int32 * about.axes)(), (ctypes.c_int16 * about.axes)()
-        self.out = ctypes.create_string_buffer(MAX_OUT)
-        columns = zip(
-            about.osp_damping, about.encoder_step, about.force_step, about.hard_limit, about.range, strict=True
-        )
-        values = (ctypes.c_uint32 * (5 * about.axes))(*[v for axis in columns for v in axis])
-        name = about.firmware.encode()
-        self.good = library.harness_init(self.memory, name, about.serial, about.period_ns, about.axes, values)
-
-    def tick(self, now, counts):
-        self.counts[:] = counts
-        n = self.lib.harness_tick(self.memory, now, self.counts, self.force, self.out)
-        return tuple(self.force), self.out.raw[:n]
-
-    def receive(self, data, now):
-        self.lib.harness_receive(self.memory, data, len(data), now)
-
-    def estop(self):
-        self.lib.harness_estop(self.memory)
-
-    def fault(self):
-        self.lib.harness_fault(self.memory)
-
-    def set_deadman(self, held):
-        self.lib.harness_deadman(self.memory, held)
-
-    def set_tick(self, number):
-        self.lib.harness_number(self.memory, number)
-
-    deadman, k = property(fset=set_deadman), property(fset=set_tick)
 
 
 class Traffic:
@@ -188,17 +130,6 @@ class Traffic:
 
 def shifted(tick: int, by: int) -> int:
     return (tick + by) & 0xFFFF
-
-
-def framed(message) -> bytes:
-    """Encode a message without the checks of encode()."""
-    return enclosed(pack(message))
-
-
-def enclosed(payload: bytes) -> bytes:
-    """Return a frame around any payload."""
-    blocks = (payload + struct.pack("<I", crc32(payload))).split(b"\0")
-    return b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
 
 
 def mutated(rng: random.Random, frame: bytes) -> bytes:
@@ -309,23 +240,45 @@ def test_c_and_python_agree_byte_for_byte(library, episodes):
     assert answered > 12_000
 
 
-@pytest.mark.slow
-@needs_gcc
-def test_no_sanitizer_complains(tmp_path, episodes):
-    """An executable with AddressSanitizer and UBSan gives the same answers to the same traffic."""
-    program = tmp_path / "harness"
+def sanitized(folder: Path, *flags: str):
+    """Compile with AddressSanitizer and UBSan. Return a function that plays a script and compares the answers."""
+    program = folder / "harness"
     sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DHARNESS_MAIN"]
     try:
-        build(GCC, "-std=c99", *STRICT, *sanitize, f"-I{HEADER}", HARNESS / "harness.c", "-o", program)
+        build(GCC, "-std=c99", *STRICT, *sanitize, *flags, f"-I{HEADER}", HARNESS / "harness.c", "-o", program)
     except AssertionError as failed:
         if "cannot find" in str(failed):
             pytest.skip("this gcc comes without libasan or libubsan")
         raise
-    for about, script, answers, _ in [*episodes[::3], episodes[-1]]:
+
+    def check(about: Info, script: list[tuple], answers: list[tuple]) -> None:
         done = subprocess.run([program], input=written(about, script), capture_output=True)
         assert done.returncode == 0, done.stderr.decode()
         force = struct.Struct(f"<{about.axes}h")
         assert done.stdout == b"".join(struct.pack("<H", len(out)) + out + force.pack(*f) for f, out in answers)
+
+    return check
+
+
+@pytest.mark.slow
+@needs_gcc
+def test_no_sanitizer_complains(tmp_path, episodes):
+    """The sanitized program gives the same answers to the same traffic, and refuses nine axes."""
+    check = sanitized(tmp_path)
+    for about, script, answers, _ in [*episodes[::3], episodes[-1]]:
+        check(about, script, answers)
+    check(info(9), [], [])
+
+
+@pytest.mark.slow
+@needs_gcc
+def test_small_devices_refuse_configs_of_more_axes(tmp_path):
+    script = [("R", 0, encode(Config(1, 4, 4, 0, (100,) * 8, (100,) * 8))), ("T", 0, (0, 0))]
+    device = Device(info(2))
+    play(device, script[0])
+    answer = device.tick(0, (0, 0))
+    assert Decoder().feed(answer[1])[0].refused == Refused.AXES
+    sanitized(tmp_path, "-DHL_MAX_AXES=2")(info(2), script, [answer])
 
 
 def written(about: Info, script: list[tuple]) -> bytes:
@@ -359,6 +312,8 @@ def written(about: Info, script: list[tuple]) -> bytes:
     ids=str,
 )
 def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
+    with pytest.raises(ValueError, match="Info"):
+        Device(info(2)._replace(**wrong))
     firmware = Firmware(library, info(2)._replace(**wrong))
     assert not firmware.good
     firmware.receive(encode(Config(1, 4, 4, 0, (100, 100), (100, 100))), 0)
@@ -367,7 +322,52 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
     assert isinstance(ack, Ack)
     assert ack.refused == Refused.ESTOP
     assert forces == (0, 0)
-    assert Firmware(library, info(2)).good
+
+
+@needs_gcc
+@pytest.mark.parametrize("axes", [0, 9])
+def test_a_firmware_without_possible_axes_never_runs(library, axes):
+    with pytest.raises(ValueError, match="1 to 8"):
+        Device(info(axes))
+    firmware = Firmware(library, info(axes))
+    assert not firmware.good
+    firmware.force[:] = [7] * axes
+    assert firmware.tick(0, (0,) * axes) == ((7,) * axes, b"")  # it has no axis whose force it could set
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    "edge", [{"period_ns": 100_000}, {"period_ns": 100_000_000}, {"hard_limit": (32767, 1)}], ids=str
+)
+def test_the_edges_of_every_range_are_possible(library, edge):
+    about = info(2)._replace(**edge)
+    assert Device(about).info == about
+    assert Firmware(library, about).good
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    ("theta", "messages", "writes", "motors"),
+    [
+        (0, [Force(2, 3, 3, (30, -30))], 1, (30, -30)),
+        (0, [Force(2, 3, 3, (30, -30)), Force(2, 3, 3, (40, -40))], 1, (30, -30)),
+        (0, [Force(2, 2, 2, (30, -30)), Force(2, 4, 4, (30, -30))], 0, (20, -20)),
+        (1, [Force(2, 4, 3, (30, -30)), Stop(0), Hello()], 0, (20, -20)),
+        (0, [Stop(Reason.ESTOP), Stop(Reason.ESTOP), Hello()], 1, (0, 0)),
+        (1, [Stop(Reason.ESTOP), Stop(Reason.ESTOP), Hello()], 1, (0, 0)),
+    ],
+)
+def test_only_changed_forces_reach_motors_at_once(library, theta, messages, writes, motors):
+    """The motors get forces with theta = 0 and emergency stops before the next tick, and no needless write."""
+    device = Firmware(library, info(2))
+    early, config = Force(Command.ARM, 0, 0, (0, 0)), Config(theta, 4, 4, 0, (100, 100), (100, 100))
+    assert device.receive(framed(early) + framed(config), 0) == 0
+    for command, force in [(Command.IDLE, (0, 0)), (Command.ARM, (0, 0)), (Command.RUN, (20, -20))]:
+        device.receive(framed(Force(command, device.k + theta, device.k, force)), 0)
+        device.tick(0, (0, 0))
+    assert device.applied == (20, -20)
+    assert device.receive(b"".join(map(framed, messages)), 0) == writes
+    assert device.applied == motors
 
 
 @needs_gcc
@@ -538,11 +538,10 @@ def test_only_ticks_feed_the_boards_watchdog(sketch):
 # docs/protocol.md.
 
 
-@pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
-def device(request):
+@pytest.fixture
+def device(machine):
     """Return the Python or the C device with two axes, whose ticks the test calls one by one."""
-    make = Device if request.param == "python" else lambda about: Firmware(request.getfixturevalue("library"), about)
-    return Hand(make(info(2)))
+    return Hand(machine(info(2)))
 
 
 class Hand:
