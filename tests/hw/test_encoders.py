@@ -210,16 +210,17 @@ def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
 
     def motion(k, applied):
         if k:
+            before = v.copy()
             v[:] += (applied[-1] * STEP + bias) / mass * T
             v[:] = np.sign(v) * np.maximum(np.abs(v) - friction / mass * T, 0.0)
-            x[:] += v * T
+            x[:] += (before + v) / 2 * T
         return tuple(round(one / q) for one in x)
 
     return motion
 
 
 @pytest.mark.parametrize(
-    ("friction", "closing", "strongest"), [(0.17, False, 0.65), (0.34, False, 1.3), (0.34, True, 2.5)]
+    ("friction", "closing", "strongest"), [(0.1, False, 0.65), (0.34, False, 1.3), (0.34, True, 2.5)]
 )
 def test_stronger_forces_overcome_dry_friction(friction, closing, strongest):
     """At arming the force doubles from 0.1625 N until friction [N] hardly counts; at the end it is 2.5 N at once."""
@@ -227,7 +228,7 @@ def test_stronger_forces_overcome_dry_friction(friction, closing, strongest):
     assert np.abs(forces).max() == pytest.approx(strongest, abs=STEP)
 
 
-@pytest.mark.parametrize(("friction", "weight"), [(0.52, 0.26), (0.3, 0.25), (0.1, 0.08), (0.2, 0.0), (0.45, 0.0)])
+@pytest.mark.parametrize(("friction", "weight"), [(0.52, 0.26), (0.3, 0.2), (0.1, 0.08), (0.2, 0.0), (0.45, 0.0)])
 def test_friction_and_weight_are_no_faults(friction, weight):
     """Friction of 0.52 N and a weight of 0.26 N leave 0.8 of the motion at 1.3 N, more of it to one side."""
     for closing in (False, True):
@@ -342,19 +343,27 @@ def later(motion, ticks):
 def test_coarse_counts_are_no_hidden_delay(q):
     """At 1.3 N the free mass swings by 10 counts of 0.1 mm, whose rounding shifts its delay by at most 0.63 ticks.
 
-    This shift is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks; for coarser counts the test
-    remarks that it does not test the delay.
+    This shift is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks. But dry friction that these
+    counts hide could make the motion earlier by as much as a delay makes it later, and the test remarks on that.
     """
     test = arming_test(q=q)
     played(test, masses(q=q))
     played(arming_test(closing=True, q=q), masses(q=q))
+    for i, told in enumerate(test.remarks, 1):
+        assert re.match(rf"axis {i} may be up to \d+\.\d ticks later than agreed: counts of .* may hide it", told)
+    assert len(test.remarks) == 2
     if q <= 1e-4:
-        assert not test.remarks
         with expect_stop("late axis: 1 "):
             played(arming_test(q=q), later(masses(q=q), 2))
-    else:
-        assert all(f"delay of axis {i} is not tested" in told for i, told in enumerate(test.remarks, 1))
-        assert len(test.remarks) == 2
+
+
+@pytest.mark.parametrize(("friction", "q"), [(0.0, 1e-5), (0.06, 1e-6), (0.1, 1e-5), (0.2, 1e-6), (0.4, 1e-5)])
+def test_friction_hides_no_delay_of_rigid_devices(friction, q):
+    test = arming_test(cap=1.3, q=q)
+    played(test, rubbing(friction, q=q))
+    assert not test.remarks or friction == 0.4  # friction of 0.4 N may hide half a tick
+    with expect_stop("late axis: 1 "):
+        played(arming_test(cap=1.3, q=q), later(rubbing(friction, q=q), 1))
 
 
 REACH = [lambda t: 0.1 * min(t / 0.4, 1.0) ** 3 * (10 - 15 * min(t / 0.4, 1.0) + 6 * min(t / 0.4, 1.0) ** 2)]
