@@ -28,6 +28,7 @@ from haptic_loop.sim.trace import Growth, Trace, growths
 from haptic_loop.sim.world import SceneRecord, WorldRecord
 
 _AT_CAP = 1 - 1e-6  # share of the cap from which a force counts as cut
+_GROWN = 0.4  # growth rate times seconds from which an oscillation counts as grown: a tremor may grow by 1.5, too
 _PERCENTILES = (50, 90, 99, 100)
 _PIECE = 100_000  # ticks whose ages are computed at a time, to save memory
 
@@ -224,7 +225,8 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
         if share > 0.5:
             return f"{100 * share:.0f} % of the forces were cut in a second: {advice}"
     for i, growth in enumerate(growths, start=1):
-        if growth.trend == "grows":
+        seconds = (growth.stop - growth.first) * session.scenario.T
+        if growth.trend == "grows" and (growth.growth_rate_per_s or 0.0) * seconds > _GROWN:
             return f"an oscillation grew in arming {i}"
     return None
 

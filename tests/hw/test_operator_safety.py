@@ -32,8 +32,9 @@ from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
-from haptic_loop.hw.session_report import IncidentLog, outcome
+from haptic_loop.hw.session_report import IncidentLog, _doubt, outcome
 from haptic_loop.sim.scenario import InputError, load, parse
+from haptic_loop.sim.trace import Growth
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -285,6 +286,15 @@ def rehearsal_until_finished(scenario, link_couplings):
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.5)
     return session
+
+
+@pytest.mark.parametrize(("rate", "grew"), [(0.03, False), (0.12, True)])
+def test_a_tremor_may_grow_by_half(scenario, link_couplings, rate, grew):
+    """Over 4.8 s a rate of 0.03 1/s is a factor of 1.15, and 0.12 1/s one of 1.8."""
+    session = rehearsal_until_finished(scenario, link_couplings)
+    growth = Growth(0, 4000, rate, 0.001, 9.0, 1e-4, 5.0, "grows")
+    doubt = _doubt(session, [growth], Recorder(2))
+    assert doubt == ("an oscillation grew in arming 1" if grew else None)
 
 
 @pytest.mark.parametrize(("by_cap", "advice"), [(True, "raise --force-cap"), (False, "Raise --energy-budget")])
