@@ -7,6 +7,7 @@ if __name__ == "__main__":  # This precedes the imports, because --help does not
 
     run_command("export")
 
+import math
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -34,9 +35,10 @@ from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, listed
 # single precision, coefficients, inputs and every operation are rounded to 24 bits.
 #
 # If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, where q are
-# the unlimited forces, f the limited forces and e the slips. The tick makes the first wrong limit active or inactive
-# until none is wrong. This takes finitely many switches (docs/theory.md). The elimination keeps the order of the
-# channels and needs no pivoting, because all principal minors are positive. The tick then adds KICK e to [y; z+], with
+# the unlimited forces, f the limited forces and e the slips. At first the limits that q exceeds are active. The tick
+# makes the first wrong limit active or inactive until none is wrong. This takes finitely many switches
+# (docs/theory.md). The elimination keeps the order of the channels and needs no pivoting, because all principal minors
+# are positive. The tick then adds KICK e to [y; z+], with
 # the matrix of controller.law.Law.uncut, and sets the sent forces to f.
 #
 # Every wall adds a row to this problem, with q = a (d - c) of controller.law, the upper limit 0, and the wall's force
@@ -85,6 +87,8 @@ class ExportedBlock:
     law: Law | None = (
         None  # None if linear; otherwise `system` is the block while no force is limited and no wall touches
     )
+    theta: tuple[int, ...] = ()  # delays of the forces [samples], which the certificate covers
+    delayed: bool = True  # whether the block contains these delays
     single: tuple[float, float] | None = None  # (largest error, largest output) of single precision; None for double
 
     @property
@@ -137,7 +141,6 @@ def process_block(
     if getattr(loop.environment, "world", None):
         raise ValueError("a MuJoCo world is no linear block: export the coupling alone, without --process")
     walls, about = len(loop.environment.walls), "f = F x: the whole discrete process; the devices get -f, held for T. "
-    push = f"{walls} wall{'s' * (walls > 1)} can push, but not pull: contacts begin and end." if walls else ""
     if force_limit is not None:
         law = _limiter(stored, loop, force_limit, balls)
         limited = "Lengths of a device's force vector" if balls else "Forces"
@@ -146,14 +149,12 @@ def process_block(
             f"{', '.join(f'{f:g}' for f in force_limit)} N while positions and states are "
             "finite: the virtual contact slips instead. NaN and infinity stay in the state until the reset."
         )
-        return ExportedBlock(
-            "process", law.uncut[0], _DISPLACEMENT, _FORCE, (about, *[push] * bool(walls), delays), law
-        )
-    about += "Forces are not limited here."
-    if walls:
-        law = loop.law(stored.built())
-        return ExportedBlock("process", law.uncut[0], _DISPLACEMENT, _FORCE, (about, push, delays), law)
-    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, _FORCE, (about, delays))
+    else:
+        law, about = loop.law(stored.built()) if walls else None, about + "Forces are not limited here."
+    push = f"{walls} wall{'s' * (walls > 1)} can push, but not pull: contacts begin and end."
+    lines = (about, *[push] * bool(walls), delays)
+    system = law.uncut[0] if law else _with_a_state(loop.F(stored.built()))
+    return ExportedBlock("process", system, _DISPLACEMENT, _FORCE, lines, law, stored.loop.theta, with_theta)
 
 
 def _limiter(stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice]) -> Law:
@@ -315,7 +316,8 @@ def _solved(rows: Array, pivoting: bool) -> Array:
 def _boxed(box: _Box, q: Array) -> tuple[Array, Array]:
     """Solve f = q - M e (n,) for (e, f) by the operations of the C file, in their order and in the precision of q."""
     (M, lower, upper, weight), n, real = box, len(q), q.dtype.type
-    zero, rounding, sign = real(0), real(_rounding(real)), np.zeros(n, real)
+    zero, rounding = real(0), real(_rounding(real))
+    sign = (q > upper).astype(real) - (q < lower)
     e = f = q
     for _ in range(_turns(n)):
         active, at = sign != 0, np.where(sign < 0, lower, upper)
@@ -449,7 +451,7 @@ $about
 enum { ${NAME}_CHANNELS = $m, ${NAME}_STATES = $n };
 
 #define ${NAME}_PERIOD $T /* [s] */
-
+$macros
 typedef struct {
     ${real} z[${NAME}_STATES];
 $more_state} ${name}_state;
@@ -557,13 +559,15 @@ static ${real} ${name}_size(${real} a)
 #: C code of the box problem, for ticks in which a force would exceed its limit or a wall touches
 _LIMIT_DEFINED = """
 /* Solves f = q - M e with f within the limits; e is 0 or has the sign of the reached limit. Every turn switches the
- * first wrong limit, and eliminates among the forces at their limits. */
+ * first wrong limit, and eliminates among the forces at their limits. At first every q beyond a limit is at it. */
 static void ${name}_limit(const ${real} q[$unknowns], ${real} e[$unknowns], ${real} f[$unknowns])
 {
     ${real} a[$unknowns][$unknowns], v[$unknowns];
-    signed char sign[$unknowns] = {0};
+    signed char sign[$unknowns];
     long turn;
     int wrong, i, j, k;
+    for (i = 0; i < $unknowns; i++)
+        sign[i] = (signed char)((q[i] > ${name}_BOUND[1][i]) - (q[i] < ${name}_BOUND[0][i]));
     for (turn = 0; turn < $turns; turn++) {
         for (i = 0; i < $unknowns; i++) {
             for (j = 0; j < $unknowns; j++)
@@ -591,16 +595,16 @@ static void ${name}_limit(const ${real} q[$unknowns], ${real} e[$unknowns], ${re
             ${real} lower = ${name}_BOUND[0][i], upper = ${name}_BOUND[1][i];
             ${real} sum = q[i], size = ${name}_size(q[i]), along = sign[i] < 0 ? -v[i] : v[i], tiny;
             for (j = 0; j < $unknowns; j++)
-                if (sign[j]) {
-                    ${real} product = ${name}_M[i][j] * v[j];
-                    sum -= product;
-                    size += ${name}_size(product);
-                }
-            tiny = size * $rounding;
+                if (!sign[i] && sign[j])
+                    sum -= ${name}_M[i][j] * v[j];
             e[i] = along > 0.0${f} ? v[i] : 0.0${f};
             f[i] = sign[i] ? ${name}_BOUND[sign[i] > 0][i] : sum > upper ? upper : sum < lower ? lower : sum;
-            if (wrong)
+            if (wrong || (sign[i] ? along >= 0.0${f} : sum <= upper && sum >= lower))
                 continue;
+            for (j = 0; j < $unknowns; j++)
+                if (sign[j])
+                    size += ${name}_size(${name}_M[i][j] * v[j]);
+            tiny = size * $rounding;
             wrong = 1;
             if (!sign[i] && sum > upper + tiny)
                 sign[i] = 1;
@@ -826,6 +830,17 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
             for side, values in (("input", test.inputs), ("output", test.outputs))
         ),
     }
+    most = max(block.limiter.limit) if block.limiter else 0.0
+    macros = {
+        "PERIOD_NS": round(1e9 * system.T),
+        "THETA_LEAST": min(block.theta, default=0),
+        "THETA_MOST": max(block.theta, default=0),
+        "THETA_INCLUDED": int(block.delayed),
+        "FORCE_LIMIT_MN": math.ceil(round(1e3 * most, 6)),
+    }
+    lines = [f"#define {words['NAME']}_{macro} {value}\n" for macro, value in macros.items()]
+    shown = "/* for checks: period [ns], delays theta [samples], largest limited force [mN] or 0 */\n"
+    words["macros"] = shown + "".join(lines) if name == "process" else ""
     for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
         words[word] = ""
     if block.law:

@@ -23,7 +23,11 @@ static const uint8_t STOP_BUTTON = 11; /* normally closed to ground: pressed, un
 static const uint8_t DEADMAN = 12;     /* closes to ground while it is held: released, unplugged and broken all read HIGH */
 /* One step of force must be one step of the PWM, because the host computes its limits from the force step in INFO. Teensy 4
  * has up to 15 bits. A board with 8 bits has steps of 47 mN at 12 N, and no analogWriteResolution(). */
-static const uint8_t PWM_BITS = 12;
+#ifdef __AVR__
+#define PWM_BITS 8
+#else
+#define PWM_BITS 12
+#endif
 static const uint16_t FULL_STEPS = (uint16_t)((1UL << PWM_BITS) - 1);
 static const uint32_t FULL_FORCE_UN = 12000000; /* at full PWM, from your motor's constant */
 static const uint32_t WATCHDOG_MS = 20;         /* the board resets itself after this time without a tick */
@@ -108,7 +112,9 @@ void setup()
   pinMode(DEADMAN, INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[0]), edge0, CHANGE);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[1]), edge1, CHANGE);
-  if (PWM_BITS > 8) analogWriteResolution(PWM_BITS);
+#if PWM_BITS > 8
+  analogWriteResolution(PWM_BITS);
+#endif
   Serial.begin(2000000); /* boards with native USB ignore the rate */
   if (!hl_init(&device, &info)) /* a number in `info` is impossible: ENABLE stays low */
     for (;;) delay(1000);

@@ -20,8 +20,15 @@ static const float METRES_PER_RADIAN = 0.09f * 0.005f / 0.073f;
 static const float METRES_PER_COUNT = METRES_PER_RADIAN * 3.14159265f / SPAN;
 static const float FULL_TORQUE = 0.03f; /* [N m] of the motor at full PWM: 4.9 N at the handle */
 static const float HOME = -0.045f;      /* [m] position of the handle when it is homed */
-static const ha_limits LIMITS = {0.05f, 1.0f, 4.8f, METRES_PER_COUNT, 0.07f}; /* range, speed, cap, count, mass */
-static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* counts of timer 1, every 8 cycles */
+static const int32_t CAP_MN = 4800;     /* [mN] */
+static const ha_limits LIMITS = {0.05f, 1.0f, CAP_MN / 1000.0f, METRES_PER_COUNT, 0.07f}; /* range, speed, cap, count, mass */
+static const int32_t COUNT_NS = 8000 / (F_CPU / 1000000); /* timer 1 counts every 8 cycles */
+static const uint16_t PERIOD_COUNTS = (uint16_t)(PROCESS_PERIOD_NS / COUNT_NS);
+
+static_assert(PROCESS_CHANNELS == 1, "The Hapkit has one axis: export a scenario with one axis.");
+static_assert(PROCESS_FORCE_LIMIT_MN <= CAP_MN, "The sketch clips forces above CAP_MN: export with a smaller --force-limit.");
+static_assert(PROCESS_PERIOD_NS % COUNT_NS == 0 && PROCESS_PERIOD_NS / COUNT_NS < 65536,
+              "Timer 1 cannot count this T: choose a multiple of 0.5 us below 32 ms.");
 
 static ha_runner runner;
 static int16_t last;
@@ -76,7 +83,7 @@ void setup()
   OCR0B = 0;
   TCCR1A = 0;                                         /* timer 1 counts the period in units of 8 cycles */
   TCCR1B = _BV(WGM12) | _BV(CS11);
-  OCR1A = PERIOD_CYCLES - 1;
+  OCR1A = PERIOD_COUNTS - 1;
   last = (int16_t)analogRead(SENSOR);
   watchdogStart(30);
   TIFR1 = _BV(OCF1A);

@@ -1,7 +1,7 @@
 /* Runs an exported tick on a board without a host, and removes the force if something goes wrong.
  *
- * Include the exported file first (python -m design.export FILE.json --process --without-theta, with --float on boards
- * without double). Once per period the sketch sets the motors to the last `force`, samples the handles, and calls ha_tick:
+ * Include the exported file first (python -m design.export FILE.json --process --without-theta --force-limit N, with --float
+ * on boards without double). Once per period the sketch sets the motors to the last `force`, samples the handles, and calls ha_tick:
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
  *   ha_home   call while the handles stand at their reference; no force acts before
@@ -16,6 +16,16 @@
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
+
+#if PROCESS_THETA_INCLUDED
+#error "Export with --without-theta: the sketch itself delays every force by a tick."
+#endif
+#if PROCESS_THETA_LEAST != 1 || PROCESS_THETA_MOST != 1
+#error "The sketch delays every force by one tick: the scenario must have theta = 1 for each axis."
+#endif
+#if PROCESS_FORCE_LIMIT_MN == 0
+#error "Export with --force-limit: no certificate covers forces that the sketch clips."
+#endif
 
 #ifndef HA_REAL
 #define HA_REAL double /* float if the file was exported with --float */

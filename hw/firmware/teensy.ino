@@ -16,10 +16,13 @@ static const uint8_t ENABLE = 6;   /* of both drivers; with an external pull-dow
 static const uint8_t DEADMAN = 12; /* closes to ground while it is held: released, unplugged and broken all read HIGH */
 static const uint8_t PWM_BITS = 12;
 static const double FULL_FORCE = 12.0, METRES_PER_COUNT = 10e-6; /* FULL_FORCE: [N] at full PWM */
-static const ha_limits LIMITS = {0.05, 1.0, 8.0, METRES_PER_COUNT, 0.25}; /* range, speed, cap, count, mass */
-static const uint32_t PERIOD_US = (uint32_t)(1e6 * PROCESS_PERIOD + 0.5);
+static const int32_t CAP_MN = 8000; /* [mN] */
+static const ha_limits LIMITS = {0.05, 1.0, CAP_MN / 1000.0, METRES_PER_COUNT, 0.25}; /* range, speed, cap, count, mass */
+static const uint32_t PERIOD_US = PROCESS_PERIOD_NS / 1000;
 
-static_assert(PROCESS_CHANNELS <= 2, "pins for two axes are named above");
+static_assert(PROCESS_CHANNELS <= 2, "The sketch names pins for two axes: add pins, or export fewer axes.");
+static_assert(PROCESS_FORCE_LIMIT_MN <= CAP_MN, "The sketch clips forces above CAP_MN: export with a smaller --force-limit.");
+static_assert(PROCESS_PERIOD_NS % 1000 == 0, "The sketch counts whole microseconds: choose such a T.");
 static ha_runner runner;
 static volatile int32_t position[2];
 static int32_t home[2];

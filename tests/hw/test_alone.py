@@ -13,9 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-GCC = shutil.which("gcc")
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.certificate import prove
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.export import c_source, in_single_precision, process_block, trial
+
+GCC, GXX = shutil.which("gcc"), shutil.which("g++")
 pytestmark = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_alone.h is not compiled here")
-FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
+FIRMWARE, STUBS = Path(__file__).parents[2] / "hw/firmware", Path(__file__).parents[1] / "firmware"
 T, MASS, COUNT = 1e-3, 0.08, 2e-5  # [s], [kg], [m]
 READY, RUNNING, STOPPING = 1, 3, 4  # phases of haptic_alone.h; the next line has causes
 ASKED, RANGE, SIGN, DEAD, SCALE, LIMITS = 1, 4, 6, 7, 8, 9
@@ -23,6 +30,9 @@ ASKED, RANGE, SIGN, DEAD, SCALE, LIMITS = 1, 4, 6, 7, 8, 9
 SOURCE = """
 #define PROCESS_CHANNELS 2
 #define PROCESS_PERIOD 1e-3
+#define PROCESS_THETA_LEAST 1
+#define PROCESS_THETA_MOST 1
+#define PROCESS_FORCE_LIMIT_MN 4000
 typedef struct { REAL last[2]; } process_state;
 static double pushed;
 static inline void process_reset(process_state *s) { s->last[0] = s->last[1] = 0; }
@@ -233,3 +243,41 @@ def test_separate_presses_of_a_still_handle_never_add(board):
     board.push(ctypes.c_double(2.0))
     states = {board.tick(bench.seen, bench.force) for _ in range(700)}
     assert states == {RUNNING, STOPPING + 16 * DEAD, READY + 16 * DEAD}
+
+
+def write_export(path, theta=(1, 1), with_theta=False, limit=8.0, period=1.2e-3, single=False):
+    """Write the process of soft springs with a limiter of their proof."""
+    names, m = tuple("abc"[: len(theta)]), len(theta)
+    springs = tuple(Spring((name, GROUND), 300.0, 0.1) for name in names)
+    loop = Loop(period, theta, (0,) * m, theta, (20.0,) * m, Network(names, springs))
+    coupling = SpringDamper((300.0,) * m, (0.1,) * m)
+    stored = Stored.of(loop, coupling, prove(loop, coupling, "any-environment"))
+    block = process_block(stored, with_theta, limit and (limit,) * m)
+    block = in_single_precision(block) if single else block
+    path.write_text(c_source(block, trial(block), path.name))
+
+
+@pytest.mark.skipif(GXX is None, reason="g++ is not installed: teensy.ino is not compiled here")
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, None),
+        ({"limit": 3.0}, None),
+        ({"with_theta": True}, "Export with --without-theta"),
+        ({"theta": (2,)}, "theta = 1 for each axis"),
+        ({"theta": (1, 2)}, "theta = 1 for each axis"),
+        ({"theta": (0, 1)}, "theta = 1 for each axis"),
+        ({"limit": None}, "Export with --force-limit"),
+        ({"limit": 8.1}, "clips forces above CAP_MN"),
+        ({"theta": (1, 1, 1)}, "pins for two axes"),
+        ({"period": 1.2345678e-3}, "whole microseconds"),
+    ],
+    ids=str,
+)
+def test_a_sketch_refuses_exports_that_do_not_fit(options, words, tmp_path):
+    write_export(tmp_path / "coupling-process.c", **options)
+    command = [GXX, "-std=gnu++11", "-fsyntax-only", "-I.", f"-I{FIRMWARE}", f"-I{STUBS}", "-x", "c++"]
+    command += [FIRMWARE / "teensy.ino"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == (words is None), done.stderr
+    assert words is None or words in done.stderr

@@ -1,6 +1,7 @@
 """Sketches without a host run an exported tick on a simulated ATmega328P and Cortex-M7 (`make firmware`)."""
 
 import re
+import runpy
 import subprocess
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import _sequential, process_block
 from haptic_loop.sim.scenario import load as load_scenario
+from tests.hw.test_alone import write_export
 
 pytestmark = pytest.mark.firmware
 
@@ -42,8 +44,12 @@ def build(folder, *command):
 
 
 def exported(folder, limit, *scenario, single=False):
-    """Design, prove and export the process of a scenario by the commands, and return its block."""
-    assert design.main([*scenario, "--out", str(folder / "coupling.json")]) == 0
+    """Design, prove and export the process of a scenario by the commands, and return its block.
+
+    Without a scenario, the coupling is already in the folder.
+    """
+    if scenario:
+        assert design.main([*scenario, "--out", str(folder / "coupling.json")]) == 0
     words = ["--process", "--without-theta", "--force-limit", str(limit), *["--float"] * single]
     assert export.main([str(folder / "coupling.json"), *words, "--out", str(folder / "coupling-process.c")]) == 0
     stored = load(folder / "coupling.json")
@@ -92,9 +98,21 @@ class Handle:
 
 @pytest.fixture(scope="module")
 def hapkit(tmp_path_factory):
-    """Return the folder of the sketch, the test vector and the board, and the exported block."""
-    folder = tmp_path_factory.mktemp("hapkit")
-    block = exported(folder, 4.8, "--scenario", str(ROOT / "examples/hapkit.toml"), single=True)
+    """Return the folder of the sketch, the test vector and the board, and the exported block of springs and a mass."""
+    return hapkit_in(tmp_path_factory.mktemp("hapkit"), "--scenario", str(ROOT / "examples/hapkit.toml"))
+
+
+@pytest.fixture(scope="module")
+def walled(tmp_path_factory):
+    """Return the same for the safe wall of examples/hapkit_wall.py."""
+    folder = tmp_path_factory.mktemp("walled")
+    runpy.run_path(str(ROOT / "examples/hapkit_wall.py"))["main"](folder)
+    (folder / "wall.json").rename(folder / "coupling.json")
+    return hapkit_in(folder)
+
+
+def hapkit_in(folder, *scenario):
+    block = exported(folder, 4.8, *scenario, single=True)
     core = CORE / "cores/arduino"
     plain, plus = [*core.glob("*.c")], [*core.glob("*.cpp")]
     build(folder, "avr-gcc", *AVR, "-w", "-std=gnu11", "-c", *plain)
@@ -143,9 +161,10 @@ def swing(k):
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 
-def test_the_hapkit_repeats_the_test_vector(hapkit):
+@pytest.mark.parametrize("export", ["hapkit", "walled"])
+def test_the_hapkit_repeats_the_test_vector(export, request):
     """The exit code is 10 plus the number of wrong ticks."""
-    folder, _ = hapkit
+    folder, _ = request.getfixturevalue(export)
     assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10
 
 
@@ -163,14 +182,65 @@ def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
     assert duty.max() > 240
     np.testing.assert_array_equal(told[start + 1 :, 2:].T, [duty[:-1], force[:-1] < 0])
     limited = np.abs(f) >= f32(4.79999)
-    ticks = {"linear": told[start:][~limited], "limited": told[start:][limited]}
-    assert ticks["limited"][:, 1].max() < 20_000
+    show(capsys, block, {"linear": told[start:][~limited], "limited": told[start:][limited]})
+
+
+def show(capsys, block, ticks):
+    """Print the cycles of several kinds of ticks, which must fit into T = 1.25 ms."""
     with capsys.disabled():
         print(f"\nATmega328P, 16 MHz, {block.system.order} states in single precision, cycles at most:")
         for name, cycles in ticks.items():
             process, whole = cycles[:, 0].max(), cycles[:, 1].max()
             fits = "fits" if whole < 16_000 else "does not fit, it needs T = 1.25 ms"
             print(f"  {name} tick {process}, with sensor and motor {whole}: 1 ms has 16000, {fits}")
+            assert whole < 20_000
+
+
+def press(k):
+    """Return the hand's force: slowly up to 4.9 N, beyond the limit of 4.8 N, and back; then a sine around 0.15 N."""
+    if k > 1300:
+        return 0.15 + 0.4 * np.sin(2 * np.pi * (k - 1300) / 160)
+    return np.interp(k, [700, 1000, 1010, 1300], [0.3, 4.9, 4.9, 0.3]) if k > 700 else 0.0
+
+
+def test_the_hapkit_touches_a_wall_like_python(walled, capsys):
+    """The steps of the PWM equal those of Python's tick, while contacts begin and end and the limiter acts."""
+    folder, block = walled
+    counts, told, state = paddle(folder, 1900, press)
+    steps, matches = told[:, 2] * (1 - 2 * told[:, 3]), []
+    free = np.median(told[650:690, 0])
+    first = 690 - int(np.argmax(np.abs(told[690:0:-1, 0] - free) > 400))  # the last tick of another kind before 690
+    for start in (first, first + 1):
+        x = PER_COUNT * (counts[start:] - counts[5]).astype(f32) + HOME
+        f = _sequential(block.system, (x - x[0])[:, None], block.law, f32)[690 - start :, 0]
+        duty = np.minimum(np.abs(f) * DUTY + f32(0.5), f32(255)).astype(int)
+        matches.append((np.abs(steps[691:] + (np.sign(f) * duty)[:-1]).max(), f))
+    wrong, f = min(matches, key=lambda match: match[0])
+    assert wrong == 0, state
+    assert np.sum((f[1:] > 0) & (f[:-1] == 0)) >= 3
+    limited = f >= f32(4.79999)
+    assert limited.sum() > 10
+    kinds = {"free": f == 0, "touching": (f > 0) & ~limited, "touching, limited": limited}
+    show(capsys, block, {name: told[690:][which] for name, which in kinds.items()})
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, None),
+        ({"limit": 4.81}, "clips forces above CAP_MN"),
+        ({"theta": (1, 1), "limit": 4.8}, "The Hapkit has one axis"),
+        ({"period": 1.2501e-3}, "Timer 1 cannot count this T"),
+        ({"period": 0.033}, "Timer 1 cannot count this T"),
+    ],
+    ids=str,
+)
+def test_the_hapkit_sketch_refuses_exports_that_differ(options, words, tmp_path):
+    write_export(tmp_path / "coupling-process.c", **{"theta": (1,), "limit": 4.8, "single": True} | options)
+    command = ["avr-g++", *AVR, "-std=gnu++11", "-fsyntax-only", "-x", "c++", FIRMWARE / "hapkit.ino"]
+    done = subprocess.run([*map(str, command)], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == (words is None), done.stderr
+    assert words is None or words in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -189,6 +259,12 @@ def test_the_hapkit_removes_its_force_at_faults(hapkit, fault, cause):
     _, told, state = paddle(hapkit[0], 1400, **{"hand": swing if "held" in fault else lambda k: 0.0} | fault)
     assert state == ("1", cause)
     assert (told[-190:, 2] == 0).all()
+
+
+def test_the_example_compiles_for_boards_of_eight_bits(tmp_path):
+    """Arduino's core for AVR does not have analogWriteResolution."""
+    options = ["-std=gnu++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
+    build(tmp_path, "avr-g++", *AVR, *options, FIRMWARE / "example.ino")
 
 
 # the Teensy's processor: double precision

@@ -35,7 +35,7 @@ PRINTED = {
     "mujoco_two_fingers": ["[14]000 samples of 2 channels", "no passive hand is given more than W0 = 2 mJ"],
     "omega_in_space": ["this-environment: needs 0.46.. of the damping", "every passive hand", "of 6 channels"],
     "teleoperation": [rf"{d} samples: {0.5 * (d + 1):.4f} N s/m for each robot" for d in range(9)],
-    "hapkit_wall": ["wall of 792 N/m: .* certified, rational", "wall of 4800 N/m: .* not certified"],
+    "hapkit_wall": ["wall of 264 N/m: .* certified, rational", "wall of 1600 N/m: .* not certified"],
     "limits_of_any_coupling": [r"1.37 +-34.8. ", r"1.918 +-60.00 "],
     "monte_carlo": [
         r"no coupling: 4\d\d of 500 hands unstable",
