@@ -37,6 +37,8 @@ _HIDES, _HIDES_ALL = 0.2, 0.35
 #: with rigid devices in the strongest motion, and in the fit with friction in the strongest and in weaker motions; with
 #: compliant devices in weaker motions
 _EARLY_PLAIN, _EARLY_RUBBED, _EARLY_COMPLIANT = 9.0, (0.5, 3.0), 2.0
+#: least ticks by which friction makes the strongest motion of a compliant device later, per ratio friction / force
+_LATER_COMPLIANT = 0.5
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 #: least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09 with a rigid device of
 #: 40 g, 0.22 with those of omega-pair and 0.38 with a rigid device of 0.25 kg; dead motors leave 0.03
@@ -498,9 +500,9 @@ class EncoderTest:
         shown = late if doubt < _LATE else 0.0
         friction, error = (x / (self._pushed or 1.0) for x in (abs(rubbed.shares[2]), rubbed.doubts[2]))
         if weak and friction > _HIDES:
-            return shown, math.inf
+            return 0.0, math.inf
         if math.isfinite(self._expected.mode[self._axis]):
-            return shown, late + doubt + _EARLY_COMPLIANT * friction * weak
+            return shown - _LATER_COMPLIANT * friction, late + doubt + _EARLY_COMPLIANT * friction * weak
         latest = later + unsure + _EARLY_RUBBED[weak] * friction
         if not weak:
             latest = min(latest, late + doubt + _EARLY_PLAIN * (friction + error))
