@@ -26,6 +26,7 @@ import numpy as np
 
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.device_state import RUNNING, Device
+from haptic_loop.hw.limits import COARSEST, SafetyLimits
 from haptic_loop.hw.protocol import PROTOCOL, Force, Info, Phase, distance
 from haptic_loop.models.device import require
 from haptic_loop.models.hold import hold
@@ -255,7 +256,11 @@ def nobody(scenario: Scenario, mass: float = 0.0) -> Scenario:
 def info_of(scenario: Scenario) -> Info:
     """Return the INFO of an emulated device: the scenario's damping, limits and steps, in the units of the wire."""
     r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
-    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
+    coarsest, encoder = min(1e-12 * 0xFFFFFFFF, COARSEST * SafetyLimits.jump / r), []
+    for i, device in enumerate(scenario.axis_devices, start=1):
+        step = device.encoder_step or _ENCODER_STEP / r
+        require(f"encoder_step of channel {i}", step, math.ceil(1e12 * _REACH / r / _FARTHEST) * 1e-12, coarsest, "m")
+        encoder.append(round(1e12 * step))
     step = _FORCE_STEP if scenario.unit == "m" else max(1, math.ceil(1e6 * max(limits) / 30000))
     return Info(
         version=PROTOCOL,

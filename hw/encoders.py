@@ -233,6 +233,14 @@ class _Fit(NamedTuple):
         return cls(shares, 12**0.5 * noise * lengths, bool(shares[-1] ** 2 > most), rest, fitted)
 
 
+class _Answer(NamedTuple):
+    """The motion with which an axis has passed its test."""
+
+    size: float  # as a multiple of the expected motion
+    sided: float  # difference of the motions in the two directions, as a share of their sum
+    rounding: float  # largest error of `size` that rounding causes
+
+
 class CheckedAxes(NamedTuple):
     """The axes whose encoders and motors are checked."""
 
@@ -263,6 +271,9 @@ class _Block:
         wanted, late, heavy, rate, even = map(self._fast, parts)
         moved, power = self._fast(position), float(wanted @ wanted) or 1.0
         self.size = wanted @ moved / power  # as a multiple of the expected motion
+        #: bound of the error of the size that rounding causes; the errors of two motions add up to at most sqrt(2)
+        #: times as much (the largest difference of 99.97 % of simulated motions of two counts)
+        self.rounding = 0.9 * float(q[axis] / (self.reach or 1.0))
         # standard deviation [m] of rounding, or of noise if that is larger: the range `still` / 2 spans four of them
         noise = q * np.maximum(12**-0.5, ranges / 8)
         own = np.maximum((moved**2).sum(axis=0) - count * noise**2, count * noise**2)
@@ -329,20 +340,20 @@ class EncoderTest:
         axes: CheckedAxes,
         expected: Expected,
         at_once: bool = False,
-        before: Sequence[tuple[float, float]] | None = None,
+        before: Sequence[_Answer] | None = None,
     ) -> None:
         """Test the axes one after the other against the `expected` motion.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
-        `before` has the sizes and one-sided shares of motions at arming, which the test at arming stores in `sizes`.
+        `before` has the answers at arming, which the test at arming stores in `sizes`.
         """
         self._at_once, self._closing, self._before = at_once, before is not None, before
-        self.sizes: list[tuple[float, float]] = []
+        self.sizes: list[_Answer] = []
         self._axes, self._units, self._expected = axes, axes.units, expected
         lever, T = axes.limits.lever, axes.T
         push = 2 * _TEST_SPEED / (lever * _PULSE * _TEST_HALF) * self._closing
-        most = [max(_TEST_FORCE * lever, push * mass) for mass in expected.mass]
-        self._strongest = list(map(min, axes.limits.cap, most))
+        self._most = [max(_TEST_FORCE * lever, push * mass) for mass in expected.mass]  # (m,) [N] without a cap
+        self._strongest = list(map(min, axes.limits.cap, self._most))
         self._lead, self._half = max(1, round(_TEST_BEFORE / T)), max(2, round(_TEST_HALF / T))  # [ticks]
         self._axis, self._last = -1, None
         self.remarks: list[str] = []  # what the test could not judge
@@ -420,10 +431,12 @@ class EncoderTest:
         size, moves, weaker, self._weaker = float(block.size[axis]), block.moves[axis], self._weaker, math.nan
         others = [i + 1 for i in np.flatnonzero(block.follows & (abs(block.size) > _CROSS)).tolist() if i != axis]
         self._swings |= bool(moves and block.swings)
+        faint = 2 * self._axes.still[axis] * self._units.encoder_step[axis]  # [m] motion that counts may hide
         if not moves:
             self._stuck = self._pushed, float(block.reach)
         if not (block.follows[axis] and block.swings):
-            return f"a force on {name} moves encoder {others[0]}: axes are swapped" if others and not moves else None
+            swapped = others and not moves and block.reach > faint  # a weak force may move it by less than a count
+            return f"a force on {name} moves encoder {others[0]}: axes are swapped" if swapped else None
         delay, *fits = block.fits()
         # differences of the motions in the two directions, and the errors of these differences
         wholes = abs(float(fits[0].shares[0])) or 1.0, 1.0
@@ -433,9 +446,10 @@ class EncoderTest:
         (own, _, friction, fault), doubts = best.shares, best.doubts
         if max(abs(fault), doubts[0]) < _CLEAN:
             self._weaker = float(own + doubts[0])
-        farthest, sided_before = self._before[axis] if self._before else (0.0, 0.0)
+        farthest, sided_before, rounded = self._before[axis] if self._before else _Answer(0.0, 0.0, 0.0)
         weak = self._block < _BLOCKS - 1 + (self._closing and not self._unknown_hands)
-        least, most_uneven, most_late = _WEAKENED * farthest, _UNEVEN + sided_before, _LATE + self._at_once
+        least = min(_WEAKENED * farthest, farthest - math.hypot(rounded, block.rounding))
+        most_uneven, most_late = _UNEVEN + sided_before, _LATE + self._at_once
         small, lopsided = size < 1 / _TEST_RATIO, sided - unsure > most_uneven
         if rough:
             late = latest = 0.0  # A transmission that is not as declared looks like a delay.
@@ -477,13 +491,12 @@ class EncoderTest:
             self.remarks.append(f"{name} may be up to {latest:.1f} ticks later than agreed: {coarse}")
         stuck, reach = self._stuck
         slip = stuck - _STICKS * (abs(friction) + doubts[2])  # [N] force that friction at rest leaves to the axis
-        faint = 2 * self._axes.still[axis] * self._units.encoder_step[axis]
         dead = slip > 0 and _SLID * reach * slip / stuck > faint
         zone = weaker < _ZONE * own and abs(friction) + doubts[2] < _RUBBED * self._pushed
         if (dead or zone) and not self._closing:
             than = f"{weaker / own if zone else 0.0:.2g} times as far as expected of its motion under twice the force"
             return f"{name} moves {than}, and not because of dry friction: its motor has a dead zone"
-        self.sizes.append((size, sided))
+        self.sizes.append(_Answer(size, sided, block.rounding))
         return ""
 
     def _delay(self, plain: _Fit, rubbed: _Fit, weak: bool) -> tuple[float, float]:
@@ -509,6 +522,15 @@ class EncoderTest:
         clear = unsure < _LATE and friction < _HIDES_ALL
         return max(shown, later if clear else 0.0), latest
 
+    def _advice(self, needed: float) -> str:
+        """Return what helps where an axis needs the force `needed` [N] to move by two counts."""
+        limits, most = self._axes.limits, self._most[self._axis]
+        if self._strongest[self._axis] >= most or 0.75 * needed > most:  # motions of 1.5 counts often pass
+            return "It is too coarse for this mass"
+        if self._strongest[self._axis] < max(limits.motors[self._axis : self._axis + 1], default=0.0):
+            return f"Raise --force-cap to {math.ceil(100 * min(needed, most) / limits.lever) / 100:g} or more"
+        return f"The scenario's force_limit must allow {min(needed, most):.3g} N"
+
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""
         axis, most = self._axis + 1, self._strongest[self._axis]
@@ -519,7 +541,8 @@ class EncoderTest:
         count, expected = self._units.encoder_step[self._axis], self._answer.reach
         if expected < 2 * count:  # rounding alone can hide such a motion
             faint = f"{at} moves axis {axis} by {1e3 * expected:.2g} mm, less than 2 counts of {1e3 * count:.3g} mm"
-            return f"{faint}: its encoder is not tested. Raise --force-cap"
+            needed = most * 2 * count / expected if expected else math.inf
+            return f"{faint}: its encoder is not tested. {self._advice(needed)}"
         if self._unknown_hands and self._swings:
             free = f"axis {axis} did not move as a free handle at the end: let go of all handles before a session ends"
             return f"{free}. If nobody held it, motor or encoder is wrong"

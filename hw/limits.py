@@ -23,7 +23,7 @@ from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; fewer steps make the loop nonlinear
-_COARSEST = 0.1  # coarsest encoder step, as a share of the largest displacement in a tick (`jump`)
+COARSEST = 0.1  # coarsest encoder step, as a share of the largest displacement in a tick (`jump`)
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
 _RAMP_IN, _RAMP_OUT = 0.25, 0.1  # [s] times in which the gain rises from 0 to 1, and falls back
@@ -81,6 +81,7 @@ class SafetyLimits:
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector whose length is limited
     lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the limits; else 1
     raisable: tuple[bool, ...] = ()  # (m,) axes with a default cap below 1.3 N that --force-cap can raise; empty: none
+    motors: tuple[float, ...] = ()  # (m,) [N] force limits of the scenario, up to which --force-cap can raise caps
 
     def __post_init__(self) -> None:
         r = self.lever
@@ -146,7 +147,7 @@ class SafetyLimits:
     @property
     def widest(self) -> float:
         """The largest encoder step, and the largest noise of an encoder at rest, that a session allows [m]."""
-        return _COARSEST * self.jump
+        return COARSEST * self.jump
 
     def capped(self, forces: NDArray[np.float64], at: float = 1.0) -> NDArray[np.bool_]:
         """Return where forces (ticks, m) [N] reach the share `at` of their caps; a vector counts by its length."""

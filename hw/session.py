@@ -456,7 +456,9 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float | None = 
         small = np.repeat(each, counts) < USUAL_CAP
         scaled["raisable"] = tuple((small & (own < limits)).tolist())
     try:
-        safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
+        safety = SafetyLimits(
+            caps, vectors=vectors, motors=tuple(limits), watchdog_us=watchdog_for(scenario.T), **scaled
+        )
         return Session(scenario, safety, settings)
     except ValueError as error:
         raise InputError(str(error)) from None

@@ -21,8 +21,7 @@ CAUSES = {
     "If nobody held it, motor or encoder is wrong",
     "no answer at the end": "motor or encoder of axis did not answer a test force of up to N at the end of the session",
     "little energy": "the energy left allows of N: motor and encoder of axis are not tested. Raise --energy-budget",
-    "faint test": "a test force of up to N moves axis by mm, less than counts of mm: its encoder is not tested. "
-    "Raise --force-cap",
+    "faint test": "a test force of up to N moves axis by mm, less than counts of mm: its encoder is not tested.",
     "wrong sign": "axis has the wrong sign: a positive force moves it to negative counts. Reverse its motor or encoder",
     "swapped axes": "a force on axis moves encoder: axes are swapped",
     "connected axes": "a force on axis moves encoder, too: two axes are connected to each other",

@@ -198,6 +198,15 @@ def test_faults_of_a_knob_are_at_the_hand():
     assert jumps._broken(limit, 0)(1.0) == pytest.approx(0.012)
 
 
+def test_coarse_wheels_are_refused_in_radians(tmp_path):
+    """900 counts per turn are 6.98 mrad; 2 mrad, or 0.3 mm at 0.15 m, are a tenth of the largest motion in a tick."""
+    path = tmp_path / "wheel.toml"
+    path.write_text(WHEEL.read_text().replace("force_limit = 8.0", f"force_limit = 8.0\nencoder_step = {np.pi / 450}"))
+    with pytest.raises(InputError) as error:
+        import_module("haptic_loop.cli.bridge").main(["--scenario", str(path), "--rehearse"])
+    assert says(in_unit(str(error.value)), "encoder_step of channel 1 is 0.00698132 .. 0.002 rad")
+
+
 @pytest.mark.parametrize("cap", [None, 5.0])
 def test_a_healthy_knob_finishes_its_rehearsal(cap, tmp_path):
     """The default cap of 0.5 N holds 0.01 N m, 5 N are the knob's own limit of 0.1 N m."""

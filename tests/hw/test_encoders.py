@@ -2,6 +2,7 @@
 
 import re
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from runpy import run_path
 
@@ -12,6 +13,7 @@ from msgspec.structs import replace
 from sessions import in_fork, inject_faults
 from shared import checkered
 
+from haptic_loop.hw.control import CouplingRequest, certified_couplings
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.encoders import CheckedAxes, EncoderMonitor, EncoderNoise, EncoderTest, Expected
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
@@ -19,7 +21,7 @@ from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.protocol import Phase, SafetyStop, State
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
-from haptic_loop.models.human import Human, Link
+from haptic_loop.models.human import Human, Link, Voluntary
 from haptic_loop.sim.scenario import InputError, load
 
 T = 1.2e-3
@@ -108,8 +110,11 @@ def played(test, motion, ticks=6000):
     raise AssertionError("the test does not end")
 
 
-def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6, motor=lambda force: force):
-    """Return a `motion` of two free masses: it sums forces twice, independently of the model of EncoderTest."""
+def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6, motor=lambda force: force, begin=0.0):
+    """Return a `motion` of two free masses: it sums forces twice, independently of the model of EncoderTest.
+
+    Both begin at the position `begin` [counts].
+    """
 
     x, v = np.zeros(2), np.zeros(2)
 
@@ -119,7 +124,7 @@ def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6, motor=lambd
         else:
             v[:] += motor(applied[-1] * STEP) / mass * T
             x[:] += v * T
-        return tuple(round(scale * signs[i] * x[order[i]] / q) for i in range(2))
+        return tuple(round(scale * signs[i] * x[order[i]] / q + begin) for i in range(2))
 
     return motion
 
@@ -326,6 +331,38 @@ def test_a_saturated_motor_fails_the_last_test(most, mass):
     else:
         with expect_stop(r"(wrong scale|weaker motor): 1 0\.(47|69)"):
             played(last, limited)
+
+
+@pytest.mark.parametrize("q", [3e-4, 5e-4])
+def test_rounding_is_no_weaker_motor(q):
+    """At 1.3 N the free mass swings by 1.02 mm, 2 counts of 0.5 mm: places between counts change it by up to 40 %."""
+    firsts = []
+    for begin in np.arange(0.0, 1.0, 0.125):
+        first = arming_test(cap=1.3, q=q)
+        played(first, masses(q=q, begin=begin))
+        firsts.append(first.sizes)
+    for sizes, begin in product(firsts, np.arange(0.0, 1.0, 0.125)):
+        played(arming_test(cap=1.3, before=sizes, known=True, q=q), masses(q=q, begin=begin))
+
+
+@pytest.mark.parametrize("q", [1e-6, 5e-5, 1e-4, 1.5e-4])
+def test_half_a_motor_is_weak_in_coarse_counts(q):
+    first, half = arming_test(cap=1.3, q=q), lambda force: 0.5 * force
+    played(first, masses(q=q, begin=0.3))
+    for begin in np.arange(0.0, 1.0, 0.25):
+        with expect_stop("wrong scale: 1|weaker motor: 1"):
+            played(arming_test(cap=1.3, before=first.sizes, known=True, q=q), masses(q=q, begin=begin, motor=half))
+
+
+def test_a_hand_that_moves_swaps_no_axes():
+    """A hand moves axis 1 by 8 counts of 80 um, while 0.16 N move axis 2 by only one."""
+    devices = [replace(device, encoder_step=8e-5) for device in load("omega-pair-rigid").device]
+    hand = Human((Link(0.05, 1.0, 60.0),), Voluntary(0.006, 0.4, phase=3.5))
+    scenario = load("omega-pair-rigid").replace(device=devices, human=(hand, hand))
+    session = session_for(scenario, LinkSettings(measure=60, held=True), None)
+    couplings = certified_couplings(CouplingRequest(scenario), 1, spare=0)
+    Rehearsal(session, Emulator(scenario), lambda ages: couplings).run_until_armed(1.5)
+    assert session.stage == Stage.ARMED, session.cause
 
 
 def test_friction_hides_no_wrong_sign():
@@ -628,8 +665,25 @@ def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
 @pytest.mark.parametrize(("cap", "far", "closing"), [(0.05, "0.039", False), (0.15, "0.12", True)])
 def test_motions_below_two_counts_test_nothing(cap, far, closing):
     """At 0.05 N the free mass swings by 0.039 mm, which an encoder with counts of 0.1 mm hardly shows."""
-    with expect_stop(rf"faint test: {cap} 1 {far} 2 0\.1$"):
+    with expect_stop(rf"faint test: {cap} 1 {far} 2 0\.1 "):
         played(arming_test(cap=cap, q=1e-4, closing=closing), masses(q=1e-4))
+
+
+@pytest.mark.parametrize(
+    ("cap", "q", "motor", "advice"),
+    [
+        (0.1, 1e-4, 8.0, "Raise --force-cap to 0.26 or more"),
+        (0.1, 1e-4, 0.1, "force_limit must allow 0.255 N"),
+        (0.1, 1e-3, 8.0, "too coarse"),
+        (1.3, 6e-4, 8.0, "too coarse"),
+    ],
+)
+def test_faint_tests_say_what_helps(cap, q, motor, advice):
+    """0.1 N move the mass by 0.079 mm, and 1.3 N, the strongest force at arming, by 1.02 mm."""
+    limits = SafetyLimits((cap, cap), motors=(motor,) * 2)
+    axes = CheckedAxes(limits, Units((q, q), (STEP, STEP), (10**6, 10**6)), T, (1, 1))
+    with pytest.raises(SafetyStop, match=advice):
+        played(EncoderTest(axes, Expected(free_pair(), False)), lambda k, applied: (0, 0))
 
 
 def test_forces_that_return_stop_nothing():
