@@ -60,7 +60,7 @@ class Rig:
         source = (self.device.k - back) & 0xFFFF
         self.say(Force(command, (source + self.config.theta) & 0xFFFF, source, force), after=after)
 
-    def tick(self, counts=(5, -6)) -> list:
+    def tick(self, counts=(70_005, -6)) -> list:
         self.now += T
         self.forces, sent = self.device.tick(self.now, counts)
         self.said = self.decoder.feed(sent)
@@ -99,7 +99,7 @@ def test_unconfigured_devices_answer_hello_and_config_only():
     rig.say(CONFIG)
     ack, state = rig.tick()
     assert ack == Ack(config_crc(CONFIG), Refused.ACCEPTED)
-    assert (state.phase, state.tick, state.t_us, state.counts) == (Phase.DISARMED, 8, 8 * T, (5, -6))
+    assert (state.phase, state.tick, state.t_us, state.counts) == (Phase.DISARMED, 8, 8 * T, (70_005, -6))
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,8 @@ def test_with_theta_zero_idle_ramps_at_once():
 
 
 def test_the_margin_is_time_before_the_latch():
-    for theta, after, margin in [(1, 300, 900), (2, 300, 2100), (15, 0, 18_000), (1, 1200, 0), (1, 60_000, -32_767)]:
+    late = [(1, 1200, 0), (1, 60_000, -32_767), (1, 2**31, -32_767)]
+    for theta, after, margin in [(1, 300, 900), (2, 300, 2100), (15, 0, 18_000), *late]:
         rig = Rig(CONFIG._replace(theta=theta))
         k = rig.device.k
         rig.answer(command=Command.IDLE, after=after)
@@ -334,10 +335,14 @@ def test_the_margin_is_time_before_the_latch():
     slow.answer(command=Command.IDLE, after=0)
     slow.tick()
     assert slow.state.margin_us == 32_767  # the margin is 45,000 us, but the wire carries at most 32,767
-    late = Rig(now=2**32 - T - 200)
-    late.answer(command=Command.IDLE, after=300)  # the clock wraps 200 us after the tick
-    late.tick()
-    assert (late.state.margin_us, late.state.t_us) == (900, T - 200)
+    uneven = Rig(CONFIG._replace(theta=15), info=INFO._replace(period_ns=333_333))
+    uneven.answer(command=Command.IDLE, after=300)
+    uneven.tick()
+    assert uneven.state.margin_us == 4999 - 300
+    wrapped = Rig(now=2**32 - T - 200)
+    wrapped.answer(command=Command.IDLE, after=300)  # the clock wraps 200 us after the tick
+    wrapped.tick()
+    assert (wrapped.state.margin_us, wrapped.state.t_us) == (900, T - 200)
     rig = Rig()
     rig.tick()
     rig.answer(command=Command.IDLE, back=1, after=100)  # the tick of this FORCE began 100 us ago
