@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from haptic_loop.cli import options, render
@@ -36,11 +37,12 @@ from haptic_loop.hw.identify import (
     chirp,
     estimate,
     held,
+    largest_step,
     records_of,
     settled,
     unbounded,
 )
-from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import STRONGEST, Session, session_for
@@ -51,6 +53,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 # Shares of --force in the two sittings with clamped handles; a difference between these sittings shows backlash.
 _LEVELS = 1.0, 0.5
+_STEP = 0.9  # largest motion in a tick of a device as declared, as a share of the limit for jumps of encoders
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 #: fields of a device that devices.toml takes from the scenario, the last one only where it is not identified
 _DECLARED = "force_limit", "encoder_step", "friction_max", "credible_force", "transmission_damping"
@@ -110,6 +113,7 @@ def main(argv: list[str]) -> int:
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
+    _check_motion(args, scenario)
     settings = replace(with_person(args, settings), identifies=True, held=False)
     out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
     while len(sittings) < args.sittings and (not sittings or sittings[-1].finished):
@@ -166,6 +170,28 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _swing(args: argparse.Namespace, scenario: Scenario) -> Swing:
+    r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise; options give figures at the hand
+    return Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
+
+
+def _excitation(args: argparse.Namespace, scenario: Scenario, clamped: float | None, link: int) -> Excitation:
+    """Return the excitation of a sitting; `clamped` is as for `_sitting`."""
+    force, swing = (args.force, _swing(args, scenario)) if clamped is None else (clamped * args.force, None)
+    force, slew = scenario.lever * force, scenario.lever * SafetyLimits.slew
+    return chirp(scenario.channels, scenario.T, link, force, args.band, args.seconds, swing, slew)
+
+
+def _check_motion(args: argparse.Namespace, scenario: Scenario) -> None:
+    """Raise InputError if a device as declared would move so fast that its motion looks like a jump of its encoder."""
+    moved = 1e3 * scenario.lever * largest_step(scenario, _excitation(args, scenario, None, 1))
+    if moved > (most := 1e3 * _STEP * SafetyLimits.jump):
+        raise InputError(
+            f"--speed is {args.speed:g}, --force is {args.force:g}: they move a device of the scenario by {moved:.3g} "
+            f"millimetres in a tick, and more than {most:g} may look like an encoder's jump: lower them, or T"
+        )
+
+
 def _sitting(
     args: argparse.Namespace,
     scenario: Scenario,
@@ -179,17 +205,13 @@ def _sitting(
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
-    r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise; options give figures at the hand
-    swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
+    r, swing = scenario.lever, _swing(args, scenario)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
     axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
     vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
     session = session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
-
-    def played(link: int) -> Excitation:
-        force, motion = (args.force, swing) if clamped is None else (clamped * args.force, None)
-        return chirp(scenario.channels, scenario.T, link, r * force, args.band, args.seconds, motion)
+    played = partial(_excitation, args, scenario, clamped)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]

@@ -21,10 +21,13 @@ import numpy as np
 
 from haptic_loop.controller.lti import Array, frozen
 from haptic_loop.hw.control import Controller
+from haptic_loop.hw.emulator import nobody
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction, friction
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import Session
+from haptic_loop.hw.session import STRONGEST, Session
 from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, fitted, starts, viscosity
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
@@ -95,12 +98,13 @@ class Swing:
     def of(cls, scenario: Scenario, speed: float, travel: float) -> Swing:
         """Return a swing that reaches `speed` [m/s] within +-`travel` [m] for the scenario's mass and damping.
 
-        Its forces stay within the device's limits; an axis that would need a larger force stays slower.
+        Its forces stay within the limits of device and session; an axis that would need a larger force stays slower.
         """
-        w = speed / travel
+        w, counts = speed / travel, [len(device.free) for device in scenario.device]
+        most = STRONGEST * scenario.lever / np.sqrt(np.repeat(counts, counts))
         need = [
-            min(device.force_limit, speed * abs(complex(device.damping, w * sum(device.bodies.values()))))
-            for device in scenario.axis_devices
+            min(device.force_limit, limit, speed * abs(complex(device.damping, w * sum(device.bodies.values()))))
+            for device, limit in zip(scenario.axis_devices, most.tolist(), strict=True)
         ]
         return cls(tuple(need), w / (2 * np.pi))
 
@@ -119,32 +123,49 @@ def chirp(
     band: tuple[float, float],
     seconds: float,
     swing: Swing | None = None,
+    slew: float = np.inf,
 ) -> Excitation:
     """Return the force to play: zero for 0.3 s, cosines of exponentially rising frequency, a swing, then silence.
 
     The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each of
     these three cosines takes `seconds`, and the silence takes half of this time. Two slow motions at two levels of
     force show friction that is not viscous, and the swing between them shows it at the speed of a session. After the
-    swing, a long cosine with the force of the swing shows how damping changes with frequency. Each part ends at a whole
-    cycle, so that a free mass does not drift away. Only the last part ends a quarter of a cycle later, so that the
-    device is released while it moves.
+    swing, a long cosine with the force of the swing shows how damping changes with frequency. Fast cosines become
+    smaller where their force would change by more than `slew` [N/s], because a distorted cosine pushes a mass away.
+    Each part ends at a whole cycle, so that a free mass does not drift away. Only the last part ends a quarter of a
+    cycle later, so that the device is released while it moves.
     """
 
-    def sweep(low: float, high: float, further: float = 0.0, times: int = 1) -> Array:
+    def sweep(low: float, high: float, force: Sequence[float], further: float = 0.0, times: int = 1) -> Array:
         ratio, ticks = high / low, round(times * seconds / T)
         cycles = max(1, round(times * seconds * (high - low) / np.log(ratio))) + further
-        wave = np.cos(2 * np.pi * cycles * (ratio ** (np.arange(ticks) / ticks) - 1) / (ratio - 1))
-        return np.tile(amplitude * wave[:, None], channels)
+        phase = 2 * np.pi * cycles * (ratio ** (np.arange(ticks) / ticks) - 1) / (ratio - 1)
+        most = slew / np.gradient(phase, T)
+        return np.minimum(force, most[:, None]) * np.cos(phase)[:, None]
 
     low, high = band
-    slower, span = low / np.sqrt(2.0), min(_SLOW_SPAN, high / low)
-    parts = [sweep(low, high), sweep(low, span * low)]
+    slower, span, force = low / np.sqrt(2.0), min(_SLOW_SPAN, high / low), (amplitude,) * channels
+    parts = [sweep(low, high, force), sweep(low, span * low, force)]
     if swing:
-        loud = sweep(_LOUD_HZ[0], min(_LOUD_HZ[1], 0.3 / T), times=_LOUD_LENGTH)
-        parts += [swing.signal(T), loud / amplitude * np.array(swing.force)]
-    parts.append(sweep(slower, span * slower, 0.25) / 2)
+        loud = sweep(_LOUD_HZ[0], min(_LOUD_HZ[1], 0.3 / T), swing.force, times=_LOUD_LENGTH)
+        parts += [swing.signal(T), loud]
+    parts.append(sweep(slower, span * slower, force, 0.25) / 2)
     lead, tail = (np.zeros((round(s / T), channels)) for s in (_LEAD, seconds / 2))
     return Excitation(np.concatenate([lead, *parts, tail]), T, link)
+
+
+def largest_step(scenario: Scenario, excitation: Excitation) -> float:
+    """Return the largest motion [m] in a tick that the excitation gives to a motor of the scenario, if nobody holds it.
+
+    A transmission makes a motor move faster than its handle where a chirp passes the mode.
+    """
+    scene, m = build(scenario.device, nobody(scenario).human), scenario.channels
+    plant = hold(scene.plant, scenario.T)
+    state, forced = np.zeros(len(plant.A)), excitation.signal @ -plant.B[:, scene.outside :].T
+    positions = np.zeros((len(forced), m))
+    for k, step in enumerate(forced):
+        positions[k], state = state[:m], plant.A @ state + step
+    return float(np.abs(np.diff(positions, axis=0)).max())
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from haptic_loop.cli.identify import main as identify_command
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.friction import Friction, friction
-from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, settled
+from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, largest_step, settled
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
@@ -34,6 +34,7 @@ from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 from tests.sessions import RubbingEmulator
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 STEP = 5e-6  # [m] half of an Omega's encoder step of 0.01 mm
 
 
@@ -667,3 +668,57 @@ def test_an_encoder_that_dies_gives_no_bound():
     x[1900:] = x[1900]
     with pytest.raises(ValueError, match="0 encoder steps in the last third of the record, at least 5"):
         identify(x, np.ones(3000), 1e-3, STEP, rigid=True)
+
+
+def test_no_cosine_exceeds_the_slew_rate():
+    """Without the limit, 12 N at 130 Hz would change by 9800 N/s. Slow parts keep their force."""
+    scenario = load("omega-pair-rigid")
+    swing = Swing.of(scenario, 1.5, 0.03)
+    assert swing.force == (12.0, 12.0)
+    free, slow = (chirp(2, scenario.T, 1, 6.0, (3.0, 200.0), 1.0, swing, slew).signal for slew in (np.inf, 2000.0))
+    faster = [(np.abs(np.diff(signal[:, 0])) > 2000.0 * scenario.T).sum() for signal in (free, slow)]
+    assert faster[0] > 1000
+    assert faster[1] <= 6  # where one part of the excitation follows another
+    assert np.abs(slow).max() == np.abs(free).max() == 12.0
+
+
+def test_swings_stay_within_twelve_newtons_at_the_hand():
+    """At 1.5 m/s a rim of 0.89 kg would need 67 N."""
+    wheel = load(str(EXAMPLES / "wheel.toml"))
+    swing = Swing.of(wheel, 1.5 / wheel.lever, 0.03 / wheel.lever)
+    assert swing.force == pytest.approx((12.0 * wheel.lever,))
+
+
+def test_the_largest_step_is_that_of_a_damped_mass():
+    """The closed form for constant forces: v -> e v + (1 - e) F/b with e = exp(-bT/m)."""
+    scenario = load("omega-pair-rigid")
+    excitation = chirp(2, scenario.T, 1, 2.0, (3.0, 60.0), 0.5)
+    m, b, T = scenario.device[0].mass, scenario.device[0].damping, scenario.T
+    e, v, steps = math.exp(-b * T / m), 0.0, []
+    for force in excitation.signal[:, 0].tolist():
+        steps.append(force / b * T + (v - force / b) * m / b * (1 - e))
+        v = e * v + (1 - e) * force / b
+    assert largest_step(scenario, excitation) == pytest.approx(np.abs(steps[:-1]).max(), rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["omega-pair", "omega-pair-rigid"])
+def test_fast_swings_of_healthy_devices_finish(name, tmp_path, monkeypatch):
+    """The estimation is left out."""
+
+    def no_estimates(*record):
+        raise ValueError("left out")
+
+    monkeypatch.setattr("haptic_loop.cli.identify.estimate", no_estimates)
+    options = ["--rehearse", "--scenario", name, "--measure", "60", "--speed", "1.5", "--sittings", "1"]
+    identify_command([*options, "--out", str(tmp_path)])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["session"]["log"][-1]["stage"] == "finished"
+
+
+@pytest.mark.parametrize(
+    "options", [["--speed", "1.2", "--T", "0.002"], ["--force", "6", "--scenario", str(EXAMPLES / "hapkit.toml")]]
+)
+def test_motions_that_look_like_jumps_are_refused(options, tmp_path):
+    with pytest.raises(InputError, match=r"--speed is .*, --force is .*: they move a device of the scenario by [3-9]"):
+        identify_command(["--rehearse", *options, "--out", str(tmp_path)])
