@@ -44,7 +44,7 @@ class _Exported:
     certificate: Verdict = render.figure(
         "certificate", lambda found: "[green]proved[/]" if found.proved else f"[red]none[/]: {found.reason}"
     )
-    multiplications: int = render.figure("one tick", "{} multiplications, not counting the limiter's")
+    multiplications: int = render.figure("one tick", "{} multiplications, not counting limiter and walls")
     force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")
