@@ -528,7 +528,8 @@ class EncoderTest:
         if self._strongest[self._axis] >= most or 0.75 * needed > most:  # motions of 1.5 counts often pass
             return "It is too coarse for this mass"
         if self._strongest[self._axis] < max(limits.motors[self._axis : self._axis + 1], default=0.0):
-            return f"Raise --force-cap to {math.ceil(100 * min(needed, most) / limits.lever) / 100:g} or more"
+            cap = "--force" if self._expected.rough else "--force-cap"  # the options of hw.identify and hw.bridge
+            return f"Raise {cap} to {math.ceil(100 * min(needed, most) / limits.lever) / 100:g} or more"
         return f"The scenario's force_limit must allow {min(needed, most):.3g} N"
 
     def _unanswered(self) -> str:

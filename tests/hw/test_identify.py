@@ -722,3 +722,15 @@ def test_fast_swings_of_healthy_devices_finish(name, tmp_path, monkeypatch):
 def test_motions_that_look_like_jumps_are_refused(options, tmp_path):
     with pytest.raises(InputError, match=r"--speed is .*, --force is .*: they move a device of the scenario by [3-9]"):
         identify_command(["--rehearse", *options, "--out", str(tmp_path)])
+
+
+def test_advice_names_an_option_of_identification():
+    declared = load("omega-pair-rigid")
+    device = msgspec.structs.replace(declared.device[0], encoder_step=2.9e-4)
+    scenario = nobody(declared.replace(device=(device, device)))
+    session = Session(
+        scenario, SafetyLimits((0.2, 0.2), motors=(12.0, 12.0)), LinkSettings(measure=60, held=False, identifies=True)
+    )
+    excitation = chirp(2, scenario.T, 1, 0.2, (3.0, 60.0), 0.5)
+    Rehearsal(session, Emulator(scenario), lambda ages: [excitation]).run_until_armed(1.5)
+    assert re.search(r"its encoder is not tested\. Raise --force to 0\.\d+ or more", session.cause)
