@@ -100,8 +100,9 @@ class _Report:
         return f"By these records the damping is at least {bounds}, up to {speed:.2f} m/s."
 
     def lines(self) -> list[str]:
+        told = "" if self.bounded else self.reason or ""  # the verdict has this reason
         refused = [f"no bounds of motor and transmission: {self.no_transmissions}"] if self.no_transmissions else []
-        return [*refused, *(f"[yellow]{warning}[/]" for warning in self.warnings)]
+        return [*refused, *(f"[yellow]{warning}[/]" for warning in self.warnings if warning not in told)]
 
 
 def main(argv: list[str]) -> int:
@@ -134,7 +135,8 @@ def main(argv: list[str]) -> int:
             own, end = slice(end, end + len(device.free)), end + len(device.free)
             tables.append(_table(device, report.axes[own], report.transmissions and report.transmissions[own]))
         files.append(write(out / "devices.toml", "\n".join(tables)))
-    shown = [_figures(report), *([_bounds(report.transmissions)] if report.transmissions else [])]
+    shown = [_figures(report)] if report.axes else []
+    shown += [_bounds(report.transmissions)] if report.transmissions else []
     render.publish(args, report, shown, report.lines(), out, files, report.verdict)
     right = report.bounded and not report.no_transmissions
     return options.exit_code(right, bool([*sittings, *clamped][-1].signals))
@@ -237,7 +239,7 @@ def _sitting(
         except ValueError as error:
             reason = str(error)
     elif session.stage != Stage.FINISHED or not len(recorder):
-        reason = f"the session ended in {session.stage}: {session.cause}"
+        reason = f"the session ended as {session.stage}: {session.cause}"
     trace = None
     if len(recorder):
         trace = recorder.trace(session.units, scenario.T, plain(report)).save_npz(out / f"trace-{number}.npz")

@@ -553,13 +553,19 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(("fault", "words"), FAULTS.items())
-def test_wrong_axes_are_refused_before_the_excitation(fault, words, tmp_path):
-    """The session ends in the test force of at most 1.3 N, no excitation begins, and no second sitting follows."""
+def test_wrong_axes_are_refused_before_the_excitation(fault, words, tmp_path, capsys):
+    """The session ends in the test force of at most 1.3 N, no excitation begins, and no second sitting follows.
+
+    The command says why once, and prints no table without rows.
+    """
     options = ["--rehearse", "--measure", "60", "--out", str(tmp_path), "--fault"]
     assert identify_command([*options, *fault.split()]) == 1
     report = json.loads((tmp_path / "report.json").read_text())
     (sitting,) = report["sittings"]
     assert words in sitting["reason"]
+    verdict, *rest = capsys.readouterr().out.splitlines()
+    assert words in verdict
+    assert [line for line in rest if not line.startswith("files:")] == []
     assert words in report["session"]["log"][-1]["cause"]
     assert not (tmp_path / "devices.toml").exists()
     trace = np.load(tmp_path / "trace-1.npz")
