@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import re
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 
 import numpy as np
@@ -274,6 +274,7 @@ class Grip:
 
     channel: int  # first channel of the device, counted from 0
     target: tuple[float, ...]  # [m] displacement of the handle on each axis of the device
+    lever: float = 1.0  # of the scenario: the mouse's hand holds a rotary device at its radius
 
     @property
     def channels(self) -> range:
@@ -282,20 +283,20 @@ class Grip:
     @property
     def pull(self) -> Array:
         """The hand's force [N] on each axis, for a handle that rests at 0."""
-        return _STIFFNESS * np.array(self.target)
+        return self.lever**2 * _STIFFNESS * np.array(self.target)
 
     def force(self, scene: Scene, s: Array) -> Array:
         """Return the hand's force [N] on each axis of the handle, in the plant state s."""
         joints, n = np.array(scene.handles)[list(self.channels)], scene.model.nq
-        return self.pull - _STIFFNESS * s[joints] - _DAMPING * s[n + joints]
+        return self.pull - self.lever**2 * (_STIFFNESS * s[joints] + _DAMPING * s[n + joints])
 
 
-def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
+def _gripped(scene: Scene, grip: Grip, T: float) -> HeldPlant:
     """Return the plant with the spring and damper of the mouse's hand on a handle. Their other ends are fixed."""
     free, n = scene.plant, scene.model.nq
     A = free.A.copy()
-    for channel in channels:
-        joint, at_handle = scene.handles[channel], free.B[:, scene.tapped[channel]]
+    for channel in grip.channels:
+        joint, at_handle = scene.handles[channel], grip.lever**2 * free.B[:, scene.tapped[channel]]
         A[:, joint] -= _STIFFNESS * at_handle
         A[:, n + joint] -= _DAMPING * at_handle
     return hold(Plant(A, free.B, free.C), T)
@@ -371,6 +372,7 @@ class LiveLoop:
         """Handle keys and prepared loops, advance to `now` [s] while the mouse holds `grip`, and return the frame."""
         self._take_keys()
         self._take_finished()
+        grip = grip and replace(grip, lever=self.prepared.scenario.lever)
         self._hold(grip)
         first = self._tick
         self._run(self.pace.due(now))
@@ -509,7 +511,7 @@ class LiveLoop:
     def _start_engine(self) -> None:
         """Start an engine on the present buffer, for the plant with the mouse's hand if there is one."""
         simulation, held = self.prepared.simulation, self._grip
-        plant = _gripped(simulation.scene, held.channels, simulation.scenario.T) if held else simulation.plant
+        plant = _gripped(simulation.scene, held, simulation.scenario.T) if held else simulation.plant
         self._engine = ExactEngine(plant)
         self._engine.start(self._buffer)
 

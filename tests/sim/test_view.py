@@ -311,7 +311,7 @@ def test_the_mouse_adds_a_spring_and_damper(none):
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
-    expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, range(1), SCENARIO.T)
+    expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, Grip(0, (0.0,)), SCENARIO.T)
     # `held` and `expected` are exponentials of the same matrix, whose entries reach 1e5
     assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
@@ -319,7 +319,9 @@ def test_the_mouse_adds_a_spring_and_damper(none):
 
 def test_the_mouse_pulls_and_releases_handles():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
-    assert dominant_mode(close(_gripped(soft.simulation.scene, range(1, 2), SCENARIO.T), soft.simulation.F)).growth < 0
+    assert (
+        dominant_mode(close(_gripped(soft.simulation.scene, Grip(1, (0.0,)), SCENARIO.T), soft.simulation.F)).growth < 0
+    )
     running, quiet = session(soft), session(soft)
     handle = soft.simulation.scene.handles[1]
     for k in range(1, 30):
@@ -330,6 +332,15 @@ def test_the_mouse_pulls_and_releases_handles():
     assert abs(speed) > 1e-4
     assert drawn.push[1] == pytest.approx(_STIFFNESS * (0.03 - drawn.q[handle]) - _DAMPING * speed, rel=1e-9)
     assert not running.frame(1.5).push.any()
+
+
+def test_the_mouse_holds_knobs_at_their_radius(none):
+    """At 20 mm, 200 N/m are 0.08 N m/rad and 3 N s/m are 1.2 mN m s/rad."""
+    grip, scene = Grip(0, (0.5,), lever=0.02), none.simulation.scene
+    assert grip.pull == pytest.approx([0.04])
+    state = np.zeros(2 * scene.model.nq)
+    state[scene.handles[0]], state[scene.model.nq + scene.handles[0]] = 0.1, 2.0
+    assert grip.force(scene, state) == pytest.approx([0.04 - 0.008 - 0.0024])
 
 
 def test_the_viewer_s_selection_is_a_grip(none):
