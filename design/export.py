@@ -52,6 +52,7 @@ from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, listed
 # `unsolved` counts these ticks.
 
 
+_MOST_INTEGER = 9e18  # C compares integers of 64 bits
 _TICKS = 64  # length of a test vector, longer than the fast modes and the usual delays of a loop
 _MOST_TURNS = 100_000  # largest number of switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
@@ -832,11 +833,11 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     }
     most = max(block.limiter.limit) if block.limiter else 0.0
     macros = {
-        "PERIOD_NS": round(1e9 * system.T),
+        "PERIOD_NS": round(min(1e9 * system.T, _MOST_INTEGER)),
         "THETA_LEAST": min(block.theta, default=0),
         "THETA_MOST": max(block.theta, default=0),
         "THETA_INCLUDED": int(block.delayed),
-        "FORCE_LIMIT_MN": math.ceil(round(1e3 * most, 6)),
+        "FORCE_LIMIT_MN": math.ceil(min(round(1e3 * most, 6), _MOST_INTEGER)),
     }
     lines = [f"#define {words['NAME']}_{macro} {value}\n" for macro, value in macros.items()]
     shown = "/* for checks: period [ns], delays theta [samples], largest limited force [mN] or 0 */\n"
