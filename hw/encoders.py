@@ -33,10 +33,9 @@ _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but
 #: ratios friction / force: above the first, the fit finds too little friction in weaker motions; above the second, a
 #: weight beside the friction looks like a delay
 _HIDES, _HIDES_ALL = 0.2, 0.35
-#: most ticks by which friction makes a motion earlier, per ratio friction / force, in rehearsals at 1 to 1.25 ms:
-#: with rigid devices in the strongest motion, and in the fit with friction in the strongest and in weaker motions; with
-#: compliant devices in weaker motions
-_EARLY_PLAIN, _EARLY_RUBBED, _EARLY_COMPLIANT = 9.0, (0.5, 3.0), 2.0
+#: most seconds by which friction makes a motion earlier, per ratio friction / force, in rehearsals at 0.5 to 2 ms: with
+#: rigid devices in fits without and with friction, and with compliant devices
+_EARLY_PLAIN, _EARLY_RUBBED, _EARLY_COMPLIANT = 11e-3, 4e-3, 20e-3
 #: least ticks by which friction makes the strongest motion of a compliant device later, per ratio friction / force
 _LATER_COMPLIANT = 0.5
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
@@ -486,7 +485,7 @@ class EncoderTest:
         if late_for_sure:
             what = "an encoder or motor has a hidden delay"
             return f"{name} answers {late:.1f} ticks later than agreed: {what}{self._or_undeclared}"
-        if latest > 1 + self._at_once:
+        if latest > most_late:
             coarse = f"counts of {1e3 * self._units.encoder_step[axis]:.3g} mm, or dry friction, may hide it"
             self.remarks.append(f"{name} may be up to {latest:.1f} ticks later than agreed: {coarse}")
         stuck, reach = self._stuck
@@ -502,23 +501,22 @@ class EncoderTest:
     def _delay(self, plain: _Fit, rubbed: _Fit, weak: bool) -> tuple[float, float]:
         """Return the hidden delay [ticks] that the motion shows for sure (0: none), and an upper bound of the delay.
 
-        `plain` is fitted without friction, `rubbed` with it. Friction makes motions earlier. With compliant devices the
-        plain fit notices this in `weak` motions only. With rigid devices its delay is a lower bound; the fit with
-        friction is less certain, and early in weak motions.
+        `plain` is fitted without friction, `rubbed` with it. Friction makes motions earlier, in both fits and more in
+        `weak` motions; of rigid devices, the plain fit gives a lower bound, and the other one is less certain.
         """
         (late, doubt), (later, unsure) = [
             (-float(fit.shares[1] / (fit.shares[0] or 1.0)), float(fit.doubts[1] / abs(fit.shares[0] or 1.0)))
             for fit in (plain, rubbed)
         ]
-        shown = late if doubt < _LATE else 0.0
+        shown, T = late if doubt < _LATE else 0.0, self._axes.T
         friction, error = (x / (self._pushed or 1.0) for x in (abs(rubbed.shares[2]), rubbed.doubts[2]))
         if weak and friction > _HIDES:
             return 0.0, math.inf
         if math.isfinite(self._expected.mode[self._axis]):
-            return shown - _LATER_COMPLIANT * friction, late + doubt + _EARLY_COMPLIANT * friction * weak
-        latest = later + unsure + _EARLY_RUBBED[weak] * friction
+            return shown - _LATER_COMPLIANT * friction, late + doubt + _EARLY_COMPLIANT / T * friction
+        latest = later + unsure + _EARLY_RUBBED / T * friction
         if not weak:
-            latest = min(latest, late + doubt + _EARLY_PLAIN * (friction + error))
+            latest = min(latest, late + doubt + _EARLY_PLAIN / T * (friction + error))
         clear = unsure < _LATE and friction < _HIDES_ALL
         return max(shown, later if clear else 0.0), latest
 
