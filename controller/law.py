@@ -267,7 +267,7 @@ class Limiter(Law):
         if not ((self.rho >= 0) & (self.rho < np.inf)).all():
             raise ValueError(f"rho is {self.rho.tolist()}, expected stiffnesses >= 0 in N/m")
         if self.balls and self.walls:
-            raise ValueError("walls cannot be combined with forces that are limited as vectors: limit each axis")
+            raise ValueError("walls cannot be combined with forces that are limited as vectors: give limits per axis")
         _ = self.problem
 
     @cached_property

@@ -91,6 +91,8 @@ class ExportedBlock:
     theta: tuple[int, ...] = ()  # delays of the forces [samples], which the certificate covers
     delayed: bool = True  # whether the block contains these delays
     single: tuple[float, float] | None = None  # (largest error, largest output) of single precision; None for double
+    rotary: bool = False  # whether positions are in rad, and forces in N m
+    certified: bool = False  # whether the proof in the coupling's file holds for this block
 
     @property
     def dtype(self) -> type[np.floating]:
@@ -155,7 +157,10 @@ def process_block(
     push = f"{walls} wall{'s' * (walls > 1)} can push, but not pull: contacts begin and end."
     lines = (about, *[push] * bool(walls), delays)
     system = law.uncut[0] if law else _with_a_state(loop.F(stored.built()))
-    return ExportedBlock("process", system, _DISPLACEMENT, _FORCE, lines, law, stored.loop.theta, with_theta)
+    rotary = loop.unit == "rad"
+    return ExportedBlock(
+        "process", system, _DISPLACEMENT, _FORCE, lines, law, stored.loop.theta, with_theta, rotary=rotary
+    )
 
 
 def _limiter(stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice]) -> Law:
@@ -837,10 +842,12 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
         "THETA_LEAST": min(block.theta, default=0),
         "THETA_MOST": max(block.theta, default=0),
         "THETA_INCLUDED": int(block.delayed),
+        "CERTIFIED": int(block.certified),
+        "ROTARY": int(block.rotary),
         "FORCE_LIMIT_MN": math.ceil(min(round(1e3 * most, 6), _MOST_INTEGER)),
     }
     lines = [f"#define {words['NAME']}_{macro} {value}\n" for macro, value in macros.items()]
-    shown = "/* for checks: period [ns], delays theta [samples], largest limited force [mN] or 0 */\n"
+    shown = "/* for checks: period [ns], delays theta [samples], certified, in rad, largest limited force [mN] */\n"
     words["macros"] = shown + "".join(lines) if name == "process" else ""
     for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
         words[word] = ""
@@ -909,7 +916,8 @@ def with_origin(
     """Add comment lines on the coupling's `file` and on its proof; `claim` is a further line."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
     proved = _guarantee(stored, verdict, block.limiter)
-    return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))
+    certified = stored.certificate is not None and verdict.proved
+    return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])), certified=certified)
 
 
 def _gains(stored: Stored) -> str:

@@ -27,6 +27,16 @@
 #error "Export with --force-limit: no certificate covers forces that the sketch clips."
 #endif
 
+#if !PROCESS_CERTIFIED
+#error "The exported file is not certified: export a coupling whose proof python -m design.check confirms."
+#endif
+#if PROCESS_ROTARY
+#error "The sketch measures metres and newtons: export a scenario without unit = rad."
+#endif
+#if PROCESS_PERIOD_NS > 4000000
+#error "The sketch tests its axes with a T of at most 4 ms."
+#endif
+
 #ifndef HA_REAL
 #define HA_REAL double /* float if the file was exported with --float */
 #endif

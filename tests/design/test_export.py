@@ -505,6 +505,11 @@ def test_an_uncertified_export_exits_with_1(place, tmp_path, capsys):
     changed = tmp_path / "changed.json"
     changed.write_text((place / "gains.json").read_text().replace("878.7", "1878.7"))
     out = tmp_path / "changed.c"
+    assert main([str(changed), "--process", "--out", str(out)]) == 1
+    assert "#define PROCESS_CERTIFIED 0\n" in out.read_text()
+    assert main([str(place / "gains.json"), "--process", "--out", str(out)]) == 0
+    assert "#define PROCESS_CERTIFIED 1\n" in out.read_text()
+    capsys.readouterr()
     assert main([str(changed), "--out", str(out), "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
     assert not outcome["certificate"]["proved"]

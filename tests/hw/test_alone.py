@@ -8,6 +8,7 @@ import ctypes
 import math
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,8 @@ ASKED, RANGE, SIGN, DEAD, SCALE, LIMITS = 1, 4, 6, 7, 8, 9
 SOURCE = """
 #define PROCESS_CHANNELS 2
 #define PROCESS_PERIOD 1e-3
+#define PROCESS_PERIOD_NS 1000000
+#define PROCESS_CERTIFIED 1
 #define PROCESS_THETA_LEAST 1
 #define PROCESS_THETA_MOST 1
 #define PROCESS_FORCE_LIMIT_MN 4000
@@ -245,15 +248,15 @@ def test_separate_presses_of_a_still_handle_never_add(board):
     assert states == {RUNNING, STOPPING + 16 * DEAD, READY + 16 * DEAD}
 
 
-def write_export(path, theta=(1, 1), with_theta=False, limit=8.0, period=1.2e-3, single=False):
-    """Write the process of soft springs with a limiter of their proof."""
+def write_export(path, theta=(1, 1), with_theta=False, limit=8.0, period=1.2e-3, single=False, **more):
+    """Write the process of soft springs with a limiter of their proof. `more` are fields of the block."""
     names, m = tuple("abc"[: len(theta)]), len(theta)
     springs = tuple(Spring((name, GROUND), 300.0, 0.1) for name in names)
     loop = Loop(period, theta, (0,) * m, theta, (20.0,) * m, Network(names, springs))
     coupling = SpringDamper((300.0,) * m, (0.1,) * m)
     stored = Stored.of(loop, coupling, prove(loop, coupling, "any-environment"))
     block = process_block(stored, with_theta, limit and (limit,) * m)
-    block = in_single_precision(block) if single else block
+    block = replace(in_single_precision(block) if single else block, **{"certified": True} | more)
     path.write_text(c_source(block, trial(block), path.name))
 
 
@@ -271,6 +274,9 @@ def write_export(path, theta=(1, 1), with_theta=False, limit=8.0, period=1.2e-3,
         ({"limit": 8.1}, "clips forces above CAP_MN"),
         ({"theta": (1, 1, 1)}, "pins for two axes"),
         ({"period": 1.2345678e-3}, "whole microseconds"),
+        ({"period": 4.001e-3}, "a T of at most 4 ms"),
+        ({"certified": False}, "is not certified"),
+        ({"rotary": True}, "metres and newtons"),
     ],
     ids=str,
 )

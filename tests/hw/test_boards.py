@@ -231,7 +231,7 @@ def test_the_hapkit_touches_a_wall_like_python(walled, capsys):
         ({"limit": 4.81}, "clips forces above CAP_MN"),
         ({"theta": (1, 1), "limit": 4.8}, "The Hapkit has one axis"),
         ({"period": 1.2501e-3}, "Timer 1 cannot count this T"),
-        ({"period": 0.033}, "Timer 1 cannot count this T"),
+        ({"period": 0.033}, "a T of at most 4 ms"),
     ],
     ids=str,
 )
