@@ -53,7 +53,9 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None, alo
     except MemoryError:
         code = _say("error: there is not enough memory for this", UNFINISHED)
     except OSError as error:  # mostly a full disk
-        code = _cannot(error)
+        place = None if error.filename else place_of(error)
+        own = f"error: {place}, which is your own code: {type(error).__name__}: {error}"
+        code = _say(own, BAD_INPUT) if place else _cannot(error)
     except Exception as error:  # Python's exit code 1 would mean that a claim does not hold.
         place, code = place_of(error), UNFINISHED  # `place` is None for a mistake in this package
         if place and is_refusal(error):

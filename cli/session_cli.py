@@ -350,7 +350,7 @@ def _own_device(text: str, scenario: Scenario, stack: ExitStack) -> HapticDevice
     if not callable(make):
         raise InputError(f"--port {text} is {make!r}, expected a class or function that takes a scenario")
     device: Any = called(f"--port {text}", make, scenario)
-    if hasattr(device, "__enter__"):
+    if hasattr(device, "__enter__") and hasattr(device, "__exit__"):
         device = stack.enter_context(device)
     lacking = [name for name in ("info", "configure", "exchange", "stop", "errors") if not hasattr(device, name)]
     if lacking:

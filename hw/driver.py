@@ -109,20 +109,32 @@ class Driver:
 
     def _call(self, session: Session) -> None:
         try:
-            if session.stage == Stage.CONNECTING:
-                answer = self.device.info()
-            elif session.stage == Stage.CONFIGURING:
-                assert session.config
-                answer = self.device.configure(session.config)
-            else:
-                force, self._force = self._force, None
-                answer = self.device.exchange(force)
-            if answer is not None:
+            if (answer := self._answer(session)) is not None:
                 self.do(session.take(answer, self.clock()))
         except wire.SafetyStop as fault:
             if session.stage == Stage.FINISHED:
                 session.retract(str(fault))
             self.do(session.end(Stage.STOPPED, str(fault), self.clock()))
+
+    def _answer(self, session: Session) -> wire.Info | wire.State | int | None:
+        """Return the device's answer. Raises PortLost for an OSError, SafetyStop for an answer of another type."""
+        answer: object
+        try:
+            if session.stage == Stage.CONNECTING:
+                call, expected, answer = "info", wire.Info, self.device.info()
+            elif session.stage == Stage.CONFIGURING:
+                assert session.config
+                call, expected, answer = "configure", int, self.device.configure(session.config)
+            else:
+                force, self._force = self._force, None
+                call, expected, answer = "exchange", wire.State, self.device.exchange(force)
+        except PortLost:
+            raise
+        except OSError as error:  # of a user's own device
+            raise PortLost(f"{type(error).__name__}: {error}") from error
+        if answer is None or isinstance(answer, expected):
+            return answer
+        raise wire.SafetyStop(f"{call}() of the device returned {answer!r}, expected {expected.__name__} or None")
 
     def load(self) -> None:
         """Load couplings for the measured delay while the device rests at zero force."""

@@ -111,7 +111,8 @@ class AxisCheck:
     def __init__(self, units: Units, T: float, lever: float) -> None:
         self._step, self._far, self._rest = units.encoder_step, ELSEWHERE / lever, round(_SETTLED / T)
         self._calm = [max(_CALM / lever, 1.5 * q) for q in self._step]
-        self._axis, self._still, self._moving = 0, 0, 0  # the axis that is asked for, ticks of rest, last axis to move
+        self._axis, self._still = 0, 0  # the axis that is asked for, ticks of rest
+        self._moving: int | None = None  # the last axis to move
         self._anchor: tuple[int, ...] = ()  # [counts] place at which the present rest began
         self._origin: tuple[int, ...] = ()  # [counts] place of rest from which the next motion is counted
         self._wrong: tuple[int, bool] | None = None  # axis and sign of the last wrong motion
@@ -123,7 +124,7 @@ class AxisCheck:
         if self._axis == len(self._step):
             return None
         if not self._origin:
-            return f"let every handle rest: axis {self._moving + 1} moves"
+            return "let every handle rest" + ("" if self._moving is None else f": axis {self._moving + 1} moves")
         ask = f"move axis {self._axis + 1} by +{1e3 * self._far:.3g} mm or more and hold it"
         return f"{self._finding}. Go back, then {ask}" if self._wrong else ask
 
@@ -132,7 +133,8 @@ class AxisCheck:
         places = zip(counts, self._anchor or counts, self._step, self._calm, strict=True)
         strayed = [abs(n - then) * q - calm for n, then, q, calm in places]
         if not self._anchor or max(strayed) > 0:
-            self._moving, self._anchor, self._still = strayed.index(max(strayed)), counts, 0
+            self._moving = strayed.index(max(strayed)) if self._anchor else None
+            self._anchor, self._still = counts, 0
             return None
         self._still += 1
         if self._still != self._rest or self._axis == len(self._step):

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from forked import run
 
 from haptic_loop.cli import bridge, identify
 from haptic_loop.design.own import named
@@ -37,6 +38,21 @@ class Opened(Emulated):
 
     def __exit__(self, *_):
         opened.append(False)
+
+
+class Unplugged(Emulated):
+    def exchange(self, force):
+        raise OSError("usb gone")
+
+
+class Number(Emulated):
+    def exchange(self, force):
+        return 3
+
+
+class Absent(Emulated):
+    def __init__(self, scenario):
+        raise OSError("no device at usb 3")
 
 
 class Deaf:
@@ -118,6 +134,28 @@ def test_mistakes_in_own_devices_are_one_line(file, module, name, said):
         with pytest.raises(InputError, match=rf"--port .*emulated\.py:{name}.* {said}") as refused:
             command.main(["--port", f"{file}:{name}", *options])
         assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "stage", "cause"),
+    [
+        ("Unplugged", "lost", "OSError: usb gone"),
+        ("Number", "stopped", "exchange() of the device returned 3, expected State or None"),
+    ],
+)
+def test_errors_of_own_devices_end_the_session(file, module, tmp_path, name, stage, cause):
+    report = tmp_path / "r.json"
+    assert bridge.main(["--port", f"{file}:{name}", *OPTIONS, "--out", str(tmp_path), "--json", str(report)]) == 1
+    session = json.loads(report.read_text())["session"]
+    assert (session["stage"], session["cause"]) == (stage, cause)
+
+
+def test_an_own_device_that_is_missing_names_its_line(file, tmp_path):
+    done = run(f"python -m hw.bridge --port {file}:Absent --arm --no-dead-man --no-axis-check", tmp_path)
+    assert done.returncode == 2
+    assert re.fullmatch(
+        r"error: .*emulated\.py, line \d+, which is your own code: OSError: no device at usb 3", done.stderr.strip()
+    )
 
 
 @pytest.mark.parametrize("port", ["missing.py:Device", "emulated.py", "emulated.py:A,emulated.py:B"])

@@ -474,7 +474,7 @@ def test_a_reserve_armed_later_replays_bit_by_bit(scenario, optimal_couplings, t
     session = rehearsal.run_until_armed(1.2)
     assert (session.stage, session.program) == (Stage.DISARMED, optimal_couplings[1])
     session.arm(session.now)
-    rehearsal.run(1e-6 * session.now + 0.8)
+    rehearsal.run(1e-6 * session.now + 1.3)
     assert session.stage == Stage.ARMED
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.2)
