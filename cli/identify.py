@@ -29,6 +29,7 @@ from haptic_loop.cli.session_cli import (
 from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
+from haptic_loop.hw.encoders import ELSEWHERE
 from haptic_loop.hw.identify import (
     Estimate,
     Excitation,
@@ -114,8 +115,9 @@ def main(argv: list[str]) -> int:
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
-    _check_motion(args, scenario)
     settings = replace(with_person(args, settings), identifies=True, held=False)
+    _session(args, scenario, settings)  # refuses impossible limits and a missing radius
+    _check_motion(args, scenario)
     out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
     while len(sittings) < args.sittings and (not sittings or sittings[-1].finished):
         sittings.append(_sitting(args, scenario, settings, out, len(sittings) + 1))
@@ -184,6 +186,15 @@ def _excitation(args: argparse.Namespace, scenario: Scenario, clamped: float | N
     return chirp(scenario.channels, scenario.T, link, force, args.band, args.seconds, swing, slew)
 
 
+def _session(args: argparse.Namespace, scenario: Scenario, settings: LinkSettings) -> Session:
+    undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
+    r, swing = scenario.lever, _swing(args, scenario)
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
+    axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
+    vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
+    return session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)
+
+
 def _check_motion(args: argparse.Namespace, scenario: Scenario) -> None:
     """Raise InputError if a device as declared would move so fast that its motion looks like a jump of its encoder."""
     moved = 1e3 * scenario.lever * largest_step(scenario, _excitation(args, scenario, None, 1))
@@ -206,12 +217,7 @@ def _sitting(
 
     `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
-    undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
-    r, swing = scenario.lever, _swing(args, scenario)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
-    axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
-    vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
-    session = session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)
+    session = _session(args, scenario, settings)
     session.record = recorder = Recorder(scenario.channels)
     played = partial(_excitation, args, scenario, clamped)
 
@@ -219,7 +225,8 @@ def _sitting(
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
 
     if args.port and number > 1:
-        task = "take every handle 5 mm or more away and let go"
+        far = f"{1e3 * ELSEWHERE / scenario.lever:.3g} mm"
+        task = f"take every handle {far} or more away and let go"
         task += ": the sitting begins 5 s later" if args.arm else "; then press key a"
         if clamped is not None:
             task = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"

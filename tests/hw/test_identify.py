@@ -16,8 +16,9 @@ import pytest
 from messages import says
 from shared import checkered
 
-from haptic_loop.cli.identify import _sitting, _table
+from haptic_loop.cli.identify import _parser, _sitting, _table
 from haptic_loop.cli.identify import main as identify_command
+from haptic_loop.controller.units import in_unit
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.friction import Friction, friction
@@ -449,6 +450,24 @@ def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
         assert session.stage == Stage.DISARMED
     rehearsal.run(1.01)
     assert session.stage == Stage.ARMING
+
+
+@pytest.mark.parametrize(("name", "far"), [("omega-pair", "5 mm"), (str(EXAMPLES / "wheel.toml"), "33.3 mrad")])
+def test_the_request_to_move_is_in_its_unit(name, far, tmp_path, monkeypatch, capsys):
+    """5 mm at the rim of a wheel of 150 mm are 33.3 mrad."""
+    monkeypatch.setattr("haptic_loop.cli.identify.hold_session", lambda *session: None)
+    args, scenario = _parser().parse_args(["--port", "x", "--arm", "--scenario", name]), load(name)
+    with pytest.raises(AttributeError):  # no session was held
+        _sitting(args, scenario, LinkSettings(), tmp_path, 2)
+    assert f"take every handle {far} or more away" in in_unit(capsys.readouterr().out, scenario.unit)
+
+
+def test_a_missing_radius_is_named_first(tmp_path):
+    """Without it, the default speed of 0.5 counts as 0.5 rad/s or more."""
+    knob = (EXAMPLES / "wheel.toml").read_text().replace("radius = 0.15", "").replace("mass = 0.02", "mass = 1e-5", 1)
+    (tmp_path / "knob.toml").write_text(knob)
+    with pytest.raises(InputError, match="radius is missing: give the distance in metres from axis to hand"):
+        identify_command(["--rehearse", "--scenario", str(tmp_path / "knob.toml"), "--out", str(tmp_path / "out")])
 
 
 def test_an_axis_that_does_not_move_is_refused():
