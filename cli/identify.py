@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import (
     add_link_options,
@@ -37,14 +39,15 @@ from haptic_loop.hw.identify import (
     capped,
     chirp,
     estimate,
+    free_motion,
     held,
-    largest_step,
     records_of,
     settled,
     unbounded,
 )
-from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import SafetyStop
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import STRONGEST, Session, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome
@@ -54,7 +57,8 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 # Shares of --force in the two sittings with clamped handles; a difference between these sittings shows backlash.
 _LEVELS = 1.0, 0.5
-_STEP = 0.9  # largest motion in a tick of a device as declared, as a share of the limit for jumps of encoders
+_SHARE = 0.9  # largest motion of a device as declared, as a share of a session's limits
+_AVERAGED = 0.01  # [s] over which a session averages a speed before it compares it with its limit
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 #: fields of a device that devices.toml takes from the scenario, the last one only where it is not identified
 _DECLARED = "force_limit", "encoder_step", "friction_max", "credible_force", "transmission_damping"
@@ -116,8 +120,7 @@ def main(argv: list[str]) -> int:
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
     settings = replace(with_person(args, settings), identifies=True, held=False)
-    _session(args, scenario, settings)  # refuses impossible limits and a missing radius
-    _check_motion(args, scenario)
+    _check_motion(args, scenario, _session(args, scenario, settings).limits)
     out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
     while len(sittings) < args.sittings and (not sittings or sittings[-1].finished):
         sittings.append(_sitting(args, scenario, settings, out, len(sittings) + 1))
@@ -195,13 +198,31 @@ def _session(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
     return session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)
 
 
-def _check_motion(args: argparse.Namespace, scenario: Scenario) -> None:
-    """Raise InputError if a device as declared would move so fast that its motion looks like a jump of its encoder."""
-    moved = 1e3 * scenario.lever * largest_step(scenario, _excitation(args, scenario, None, 1))
-    if moved > (most := 1e3 * _STEP * SafetyLimits.jump):
+def _check_motion(args: argparse.Namespace, scenario: Scenario, limits: SafetyLimits) -> None:
+    """Raise InputError if the motion of a device as declared would look like a jump of its encoder, or be too fast."""
+    x = free_motion(scenario, _excitation(args, scenario, None, 1))
+    ticks = max(2, round(_AVERAGED / scenario.T))
+    speed = float(np.abs(x[ticks:] - x[:-ticks]).max()) / (ticks * scenario.T)
+    if (moved := 1e3 * float(np.abs(np.diff(x, axis=0)).max())) > (most := 1e3 * _SHARE * limits.jump):
         raise InputError(
-            f"--speed is {args.speed:g}, --force is {args.force:g}: they move a device of the scenario by {moved:.3g} "
-            f"millimetres in a tick, and more than {most:g} may look like an encoder's jump: lower them, or T"
+            f"--speed is {args.speed:g}, --force is {args.force:g}: they move a device by {moved:.3g} mm in a tick, "
+            f"allowed are {most:.3g} mm: lower them, or T"
+        )
+    if speed > (most := _SHARE * limits.speed):
+        raise InputError(
+            f"--force is {args.force:g}, --band is {args.band[0]:g},{args.band[1]:g}: "
+            f"they move a device at {speed:.3g} m/s, allowed are {most:.3g} m/s: lower --force, or begin --band higher"
+        )
+
+
+def _check_reach(args: argparse.Namespace, scenario: Scenario, excitation: Excitation, units: Units) -> None:
+    """Raise SafetyStop if a device as declared would leave its range even from the middle."""
+    reach = 1e3 * np.abs(free_motion(scenario, excitation)).max(axis=0)
+    allowed = 1e3 * _SHARE * np.multiply(units.range, units.encoder_step)
+    for i in np.flatnonzero(reach > allowed).tolist():
+        raise SafetyStop(
+            f"--travel is {args.travel:g}, --force is {args.force:g}: they move axis {i + 1} by {reach[i]:.3g} mm, "
+            f"allowed are {allowed[i]:.3g} mm: lower them, or begin --band higher"
         )
 
 
@@ -222,7 +243,10 @@ def _sitting(
     played = partial(_excitation, args, scenario, clamped)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
-        return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
+        excitation = played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))
+        if clamped is None:
+            _check_reach(args, scenario, excitation, session.units)
+        return [excitation]
 
     if args.port and number > 1:
         far = f"{1e3 * ELSEWHERE / scenario.lever:.3g} mm"

@@ -154,8 +154,8 @@ def chirp(
     return Excitation(np.concatenate([lead, *parts, tail]), T, link)
 
 
-def largest_step(scenario: Scenario, excitation: Excitation) -> float:
-    """Return the largest motion [m] in a tick that the excitation gives to a motor of the scenario, if nobody holds it.
+def free_motion(scenario: Scenario, excitation: Excitation) -> Array:
+    """Return the motion (ticks, m) [m] that the excitation gives to the motors of the scenario, if nobody holds them.
 
     A transmission makes a motor move faster than its handle where a chirp passes the mode.
     """
@@ -165,7 +165,7 @@ def largest_step(scenario: Scenario, excitation: Excitation) -> float:
     positions = np.zeros((len(forced), m))
     for k, step in enumerate(forced):
         positions[k], state = state[:m], plant.A @ state + step
-    return float(np.abs(np.diff(positions, axis=0)).max())
+    return positions
 
 
 @dataclass(frozen=True)

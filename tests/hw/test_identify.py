@@ -22,7 +22,7 @@ from haptic_loop.controller.units import in_unit
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.friction import Friction, friction
-from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, largest_step, settled
+from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, free_motion, held, identify, settled
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
@@ -714,7 +714,7 @@ def test_swings_stay_within_twelve_newtons_at_the_hand():
     assert swing.force == pytest.approx((12.0 * wheel.lever,))
 
 
-def test_the_largest_step_is_that_of_a_damped_mass():
+def test_the_free_motion_is_that_of_a_damped_mass():
     """The closed form for constant forces: v -> e v + (1 - e) F/b with e = exp(-bT/m)."""
     scenario = load("omega-pair-rigid")
     excitation = chirp(2, scenario.T, 1, 2.0, (3.0, 60.0), 0.5)
@@ -723,7 +723,8 @@ def test_the_largest_step_is_that_of_a_damped_mass():
     for force in excitation.signal[:, 0].tolist():
         steps.append(force / b * T + (v - force / b) * m / b * (1 - e))
         v = e * v + (1 - e) * force / b
-    assert largest_step(scenario, excitation) == pytest.approx(np.abs(steps[:-1]).max(), rel=1e-9)
+    moved = np.diff(free_motion(scenario, excitation)[:, 0])
+    np.testing.assert_allclose(moved, steps[:-1], rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -745,8 +746,22 @@ def test_fast_swings_of_healthy_devices_finish(name, tmp_path, monkeypatch):
     "options", [["--speed", "1.2", "--T", "0.002"], ["--force", "6", "--scenario", str(EXAMPLES / "hapkit.toml")]]
 )
 def test_motions_that_look_like_jumps_are_refused(options, tmp_path):
-    with pytest.raises(InputError, match=r"--speed is .*, --force is .*: they move a device of the scenario by [3-9]"):
+    with pytest.raises(InputError, match=r"--speed is .*, --force is .*: they move a device by [3-9].* mm in a tick"):
         identify_command(["--rehearse", *options, "--out", str(tmp_path)])
+
+
+def test_forces_that_make_a_device_too_fast_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"--force is 6, --band is 3,200: .* at 1\.1 m/s, allowed are 0\.9 m/s"):
+        identify_command(["--rehearse", "--seconds", "1", "--force", "6", "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize("options", [["--travel", "120"], ["--speed", "1.5", "--force", "6", "--seconds", "1"]])
+def test_motions_beyond_the_range_are_refused(options, tmp_path):
+    """The cause is told before any force acts."""
+    identify_command(["--rehearse", "--measure", "60", "--sittings", "1", *options, "--out", str(tmp_path)])
+    last = json.loads((tmp_path / "report.json").read_text())["session"]["log"][-1]
+    assert last["stage"] == "refused"
+    assert re.search(r"--travel is .*, --force is .*: they move axis 1 by 1\d\d mm, allowed are 90 mm", last["cause"])
 
 
 def test_advice_names_an_option_of_identification():
