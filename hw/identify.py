@@ -209,7 +209,12 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
         if (steps := np.ptp(part) / step) < least:
             raise ValueError(f"the axis moved by {steps:.0f} encoder steps{when}, at least {least} are needed")
     hand = lever * x, force / lever, T
-    found = friction(*hand, lever * step)
+    try:
+        found = friction(*hand, lever * step)
+    except ValueError:  # fewer usable samples than the fit has parameters
+        raise ValueError(
+            f"the motion is too small for encoder steps of {1e3 * step:.3g} mm: use a finer encoder, or more --force"
+        ) from None
     law, allowed = at_radius(found, lever), _SPRUNG * lever**2
     # also refuse a stiffness that is too uncertain to exclude a hand
     if (most := law.stiffness + 2 * law.errors["stiffness"]) > allowed:

@@ -475,6 +475,16 @@ def test_an_axis_that_does_not_move_is_refused():
         identify(np.zeros(100), np.ones(100), 1e-3, STEP, rigid=True)
 
 
+@pytest.mark.parametrize("amplitude", [1.0, 2.0])
+def test_motions_below_coarse_counts_are_named(amplitude):
+    """Few filtered samples are left between the times at which the axis stays within a count."""
+    scenario, step = load("omega-pair-rigid"), 2.9e-4
+    excitation = chirp(2, scenario.T, 1, amplitude, (3.0, 200.0), 2.5, Swing.of(scenario, 0.5, 0.03), 2000.0)
+    x = step * np.round(free_motion(scenario, excitation)[:, 0] / step)
+    with pytest.raises(ValueError, match=r"too small for encoder steps of 0\.29 mm: use a finer encoder, or"):
+        identify(x, excitation.signal[:, 0], scenario.T, step, rigid=True)
+
+
 @pytest.mark.slow
 def test_a_record_with_gaps_gives_no_bound():
     scenario = load()
@@ -549,7 +559,7 @@ def test_ambiguous_friction_gives_no_bound():
     T, step = 1.2e-3, 5e-5
     force = chirp(1, T, 1, 1.0, (8.0, 60.0), 0.5).signal[:, 0]
     x = step * np.round(played(force, T, 0.5, 0.3, 0.05) / step + 0.3)
-    with pytest.raises(ValueError, match=r"moves in \d+ usable samples|does not tell viscous from dry friction"):
+    with pytest.raises(ValueError, match=r"motion is too small for encoder|does not tell viscous from dry friction"):
         identify(x, force, T, step, rigid=True)
 
 
