@@ -192,7 +192,8 @@ def _excitation(args: argparse.Namespace, scenario: Scenario, clamped: float | N
 def _session(args: argparse.Namespace, scenario: Scenario, settings: LinkSettings) -> Session:
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r, swing = scenario.lever, _swing(args, scenario)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] limit for a device lighter than declared
+    # A device that is lighter than declared moves faster than --speed; the session stops it at this speed [m/s].
+    fastest = min(2.5, max(1.0, 2 * args.speed))
     axes = max(len(device.free) for device in scenario.device)  # The excitation acts on all of them at the same time.
     vector = axes**0.5 * max(args.force, *(f / r for f in swing.force))
     return session_for(undamped, settings, cap=min(STRONGEST, vector), speed=fastest / r)

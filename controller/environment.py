@@ -57,9 +57,10 @@ def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A spring and a damper in parallel between two nodes, or between two points with several coordinates.
+    """A spring beside a damper. Both connect two nodes.
 
-    Between points the spring acts on every coordinate, or in the direction `along` only.
+    If the nodes are points with several coordinates, spring and damper act on every coordinate, or in the direction
+    `along` only.
     """
 
     between: tuple[str, str]

@@ -289,7 +289,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return Limiter(sent, self.theta, walls, limit=np.array(limit), rho=np.array(rho), balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
-        """Return the nominal environment and at most 128 vertices of its ranges (see `controller.ranges.members`)."""
+        """Return the nominal environment, and at most 128 vertices of its ranges if it has any."""
         if self.ranges:
             return members(self.network, self.ranges)
         return (Member("the nominal environment", self.environment),)

@@ -645,7 +645,7 @@ def certified_couplings(request: CouplingRequest, link: int, spare: int = 2) -> 
     return tuple(candidates)
 
 
-_LATEST = 0.95  # largest latency that a reserve is designed for, as a share of the shortest period
+_LATEST = 0.95  # A reserve is designed for latencies of up to this share of the shortest period.
 
 
 def _slower(request: CouplingRequest, than: CertifiedCoupling) -> CertifiedCoupling:

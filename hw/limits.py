@@ -23,7 +23,7 @@ from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; fewer steps make the loop nonlinear
-COARSEST = 0.1  # coarsest encoder step, as a share of the largest displacement in a tick (`jump`)
+COARSEST = 0.1  # An encoder step is at most this share of `jump`, the largest displacement in a tick.
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
 _RAMP_IN, _RAMP_OUT = 0.25, 0.1  # [s] times in which the gain rises from 0 to 1, and falls back

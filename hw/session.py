@@ -128,9 +128,9 @@ class Session:
         return self._take(0, "certified")
 
     def arm(self, now: int) -> Said:
-        """Arm a disarmed session at a person's request, or log its `hindrance` instead. Ignore other stages.
+        """Arm the session because a person asks for it. A session that is not disarmed ignores the request.
 
-        If an encoder is too noisy, the session ends.
+        If there is a `hindrance`, only log it. If an encoder is too noisy, end the session.
         """
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):

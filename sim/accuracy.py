@@ -431,7 +431,9 @@ class CrossCheck:
     integrator: str
     substeps: int
     position_relative_rms: float  # rms difference over the rms of the repeated run; null in JSON after an overflow
-    growth_rate_per_s: float  # as `simulated_growth` with this integrator, at constant periods and delays
+    growth_rate_per_s: (
+        float  # growth that `simulated_growth` finds with this integrator, at constant periods and delays
+    )
     growth_rate_difference_per_s: float  # the growth rate above minus that of the original run's engine
     agrees: bool  # whether the verdicts agree, and both runs diverged or neither did
 

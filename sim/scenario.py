@@ -504,7 +504,7 @@ def require_no_world(scenario: Scenario, what: str) -> None:
 
 
 def require_scaled_hands(scenario: Scenario) -> None:
-    """Raise InputError if nothing says how large random hands are at a rotary device."""
+    """Raise InputError for a rotary scenario with neither `radius` nor [population], which scale random hands."""
     if scenario.unit == "rad" and scenario.radius is None and scenario.population == Population():
         where = "the distance in metres from axis to hand, which scales random hands"
         raise InputError(f"radius is missing: give {where}; or give [population]")

@@ -535,7 +535,11 @@ def test_the_expected_motion_is_the_closed_form():
 
 @pytest.mark.parametrize(("noise", "stage"), [(2, Stage.FINISHED), (20, Stage.REFUSED)])
 def test_encoders_with_much_noise_do_not_arm(scenario, link_couplings, noise, stage):
-    """The range of 83 normal errors is about 5 standard deviations: 0.1 mm for 2 counts of 10 um, 1 mm for 20."""
+    """Noise of 2 counts arms, noise of 20 counts does not; the limit is a range of 0.3 mm.
+
+    A window has 83 normal errors, whose range is about 5 standard deviations. With counts of 10 um this is 0.1 mm for
+    2 counts and 1 mm for 20 counts.
+    """
     settings = {"encoder_step": 1e-5, "seconds": 3.0, "stop": 1.0}
     session, _ = session_with(scenario, link_couplings, f"axis1:noise={noise}", **settings)
     assert session.stage == stage

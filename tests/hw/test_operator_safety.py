@@ -157,12 +157,12 @@ def test_sessions_have_low_default_limits(scenario):
     args = _parser().parse_args(["--rehearse", "--continuous-force", "5"])  # the motors' rating is above the cap
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.continuous) == ((1.3, 1.3), (5.0, 5.0))
-    wheel = scenario.replace(unit="rad", radius=0.2)  # 5 N at the hand are 1 N m
+    wheel = scenario.replace(unit="rad", radius=0.2)  # At a radius of 0.2 m, a force of 5 N is a torque of 1 N m.
     assert session_for(wheel, LinkSettings(), **limits_from(args, wheel)).limits.continuous == (1.0, 1.0)
 
 
 def light_device(damping):
-    """Return a rigid device of 0.1 kg and `damping` [N s/m] that nobody holds."""
+    """Return a scenario with one rigid device. It has 0.1 kg and this `damping` [N s/m]."""
     return parse(
         f"""
 name = "light"
